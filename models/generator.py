@@ -1,0 +1,288 @@
+"""The conditional generator G(I, r): one image and one random code in, one point cloud out.
+
+The network is the two-branch point set generator of the paper (PSGN's encoder and decoder, with the code
+joined to the image features on a grid an eighth of the image's size). One rule sets every size: the grid
+gives the number of points (a quarter from a fully connected branch, the rest two per grid cell), the two
+width factors the channels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+CODE_DIM = 128
+
+# Renders stand on white and are mostly white: without centring, the constant background drowns the object,
+# and the image trunk can die while the loss still falls (the codes alone then explain the data's mean shape).
+_IMAGE_MEAN, _IMAGE_GAIN = 0.9, 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class GeneratorConfig:
+    """Everything that fixes the network's shape.
+
+    Attributes:
+        profile: name of the size, for the record.
+        image_height: height to which every image is resized, a multiple of 8.
+        image_width: width to which every image is resized, a multiple of 8.
+        trunk_width: factor on the channels of the image trunk and the code branch; 1 is the paper's.
+        decoder_width: factor on the channels behind the point where image and code meet; 1 is the paper's.
+        deterministic: leave the code branch out; codes are accepted and ignored.
+    """
+
+    profile: str = "cpu"
+    image_height: int = 96
+    image_width: int = 128
+    trunk_width: float = 0.5
+    decoder_width: float = 0.25
+    deterministic: bool = False
+
+    def __post_init__(self) -> None:
+        if self.image_height % 8 or self.image_width % 8 or min(self.image_height, self.image_width) < 8:
+            raise ValueError(
+                "GeneratorConfig: image_height and image_width must be positive multiples of 8; "
+                f"got {self.image_height} x {self.image_width}"
+            )
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of the grid on which image and code meet."""
+        return self.image_height // 8, self.image_width // 8
+
+    @property
+    def conv_points(self) -> int:
+        """Points of the convolutional branch: two per grid cell."""
+        return 2 * self.grid[0] * self.grid[1]
+
+    @property
+    def fc_points(self) -> int:
+        """Points of the fully connected branch: a quarter of all."""
+        return self.conv_points // 3
+
+    @property
+    def points(self) -> int:
+        """Points per cloud."""
+        return self.conv_points + self.fc_points
+
+
+PROFILES = {
+    "full": GeneratorConfig("full", 192, 256, 1.0, 1.0),
+    "cpu": GeneratorConfig("cpu", 96, 128, 0.5, 0.25),
+    "smoke": GeneratorConfig("smoke", 48, 64, 0.5, 0.125),
+}
+
+
+def build_generator(
+    profile: str = "cpu", deterministic: bool = False, *, config: GeneratorConfig | None = None
+) -> Generator:
+    """Builds a generator with freshly drawn weights (seed torch for reproducible ones).
+
+    Args:
+        profile: "full" (192 x 256 images, 2048 points), "cpu" (96 x 128, 512) or "smoke" (48 x 64, 128).
+        deterministic: build the counterpart without the code branch; it is called the same way.
+        config: sizes of your own; `profile` and `deterministic` are then ignored.
+
+    Example:
+        >>> model = build_generator("smoke")
+        >>> model(torch.rand(2, 3, 56, 56), torch.randn(5, 2, model.code_dim)).shape
+        torch.Size([5, 2, 128, 3])
+    """
+    if config is None:
+        if profile not in PROFILES:
+            raise ValueError(
+                f"build_generator: 'profile' must be one of {', '.join(PROFILES)}; got {profile!r}"
+            )
+        config = dataclasses.replace(PROFILES[profile], deterministic=deterministic)
+    return Generator(config)
+
+
+class Generator(nn.Module):
+    """G(I, r) -> (N, 3) points in the world frame. Call it, or `encode` once and `decode` many times."""
+
+    code_dim = CODE_DIM
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.trunk = _image_trunk(config)
+        self.code_branch = None if config.deterministic else _CodeBranch(config)
+        self.decoder = _Decoder(config)
+        _initialise(self)
+
+    @property
+    def points(self) -> int:
+        """Points per predicted cloud."""
+        return self.config.points
+
+    @property
+    def profile(self) -> str:
+        """Name of the size this network was built to."""
+        return self.config.profile
+
+    def forward(self, images: Tensor, codes: Tensor) -> Tensor:
+        """Predicts R clouds for each of B images; the trunk sees every image once.
+
+        Args:
+            images: (B, 3, H, W) in [0, 1] on white, any H and W: resized inside, without keeping the aspect.
+            codes: (R, B, code_dim), drawn from N(0, 1).
+
+        Returns:
+            (R, B, N, 3) points in the world frame.
+        """
+        if images.ndim != 4 or images.shape[1] != 3:
+            raise ValueError(f"Generator: 'images' must be (B, 3, H, W) in [0, 1]; got {tuple(images.shape)}")
+        return self.decode(self.encode(images), codes)
+
+    def encode(self, images: Tensor) -> Tensor:
+        """(B, 3, H, W) images in [0, 1] -> (B, C, H/8, W/8) features, independent of the codes."""
+        size = (self.config.image_height, self.config.image_width)
+        if tuple(images.shape[-2:]) != size:
+            images = F.interpolate(images, size=size, mode="bilinear", align_corners=False, antialias=True)
+        centred = (images - _IMAGE_MEAN) * _IMAGE_GAIN
+        return self.trunk(centred.contiguous(memory_format=torch.channels_last))
+
+    def decode(self, features: Tensor, codes: Tensor) -> Tensor:
+        """(B, C, h, w) features and (R, B, code_dim) codes -> (R, B, N, 3) points."""
+        if codes.ndim != 3 or codes.shape[1:] != (features.shape[0], self.code_dim):
+            raise ValueError(
+                f"Generator: 'codes' must be (R, {features.shape[0]}, {self.code_dim}) to match the images; "
+                f"got {tuple(codes.shape)}"
+            )
+        repeats, batch = codes.shape[:2]
+        if self.code_branch is None:
+            return self.decoder(features).expand(repeats, batch, self.points, 3)
+        tiled = features.expand(repeats, *features.shape).flatten(0, 1)
+        joined = torch.cat([tiled, self.code_branch(codes.flatten(0, 1))], dim=1)
+        joined = joined.contiguous(memory_format=torch.channels_last)
+        return self.decoder(joined).unflatten(0, (repeats, batch))
+
+
+def _widen(channels: int, factor: float) -> int:
+    return max(4, round(channels * factor))
+
+
+def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, kernel, stride, padding=(kernel - 1) // 2)
+
+
+def _conv_relu(inputs: int, *layers: tuple[int, int, int]) -> nn.Sequential:
+    """A chain of convolution + ReLU; each layer is (channels, kernel, stride)."""
+    modules: list[nn.Module] = []
+    for outputs, kernel, stride in layers:
+        modules += [_conv(inputs, outputs, kernel, stride), nn.ReLU()]
+        inputs = outputs
+    return nn.Sequential(*modules)
+
+
+def _image_trunk(config: GeneratorConfig) -> nn.Sequential:
+    c16, c32, c64, c128 = (_widen(c, config.trunk_width) for c in (16, 32, 64, 128))
+    return _conv_relu(
+        3,
+        *((c16, 3, 1), (c16, 3, 1), (c32, 3, 2)),
+        *((c32, 3, 1), (c32, 3, 1), (c64, 3, 2)),
+        *((c64, 3, 1), (c64, 3, 1), (c128, 3, 2)),
+        *((c128, 3, 1), (c128, 3, 1)),
+    )
+
+
+class _CodeBranch(nn.Module):
+    """Spreads a code over the grid: two fully connected layers, then two convolutions."""
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        super().__init__()
+        rows, columns = config.grid
+        self.spread = nn.Sequential(
+            nn.Linear(CODE_DIM, 256), nn.ReLU(), nn.Linear(256, 3 * rows * columns), nn.ReLU()
+        )
+        self.grid = config.grid
+        outputs = _widen(128, config.trunk_width)
+        self.convs = _conv_relu(3, (_widen(32, config.trunk_width), 3, 1), (outputs, 3, 1))
+
+    def forward(self, codes: Tensor) -> Tensor:
+        return self.convs(self.spread(codes).unflatten(1, (3, *self.grid)))
+
+
+class _Decoder(nn.Module):
+    """Joined features -> points: down to a bottleneck, then a fully connected and an up-convolving branch."""
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        super().__init__()
+        c64, c128, c256, c512 = (_widen(c, config.decoder_width) for c in (64, 128, 256, 512))
+        joined = _widen(128, config.trunk_width) * (1 if config.deterministic else 2)
+        self.down4 = _conv_relu(joined, (c256, 3, 2), (c256, 3, 1), (c256, 3, 1))
+        self.down5 = _conv_relu(c256, (c512, 3, 2), (c512, 3, 1), (c512, 3, 1), (c512, 3, 1))
+        self.bottleneck = _conv_relu(c512, (c512, 5, 2))
+
+        rows, columns = (math.ceil(side / 8) for side in config.grid)
+        hidden = _widen(2048, config.decoder_width), _widen(1024, config.decoder_width)
+        self.fc_hidden = nn.Sequential(
+            nn.Linear(c512 * rows * columns, hidden[0]), nn.ReLU(), nn.Linear(hidden[0], hidden[1]), nn.ReLU()
+        )
+        self.fc_points = nn.Linear(hidden[1], 3 * config.fc_points)
+
+        self.up5, self.skip5 = _deconv(c512, c256), _conv(c512, c256)
+        self.merge5 = _conv_relu(c256, (c256, 3, 1))
+        self.up4, self.skip4 = _deconv(c256, c128), _conv(c256, c128)
+        self.merge4 = _conv_relu(c128, (c128, 3, 1))
+        self.up3, self.skip3 = _deconv(c128, c64), _conv(joined, c64)
+        self.merge3 = _conv_relu(c64, (c64, 3, 1), (c64, 3, 1))
+        self.conv_points = _conv(c64, 6)
+
+    def forward(self, joined: Tensor) -> Tensor:
+        x4 = self.down4(joined)
+        x5 = self.down5(x4)
+        bottleneck = self.bottleneck(x5)
+
+        fc_points = self.fc_points(self.fc_hidden(bottleneck.flatten(1))).unflatten(1, (-1, 3))
+
+        x = self.merge5(F.relu(_crop(self.up5(bottleneck), x5) + self.skip5(x5)))
+        x = self.merge4(F.relu(_crop(self.up4(x), x4) + self.skip4(x4)))
+        # The ReLU before this one sum is in the released network (and in PSGN's); the other two sums have
+        # none.
+        x = self.merge3(F.relu(F.relu(_crop(self.up3(x), joined)) + self.skip3(joined)))
+        conv_points = self.conv_points(x).permute(0, 2, 3, 1).reshape(len(joined), -1, 3)
+        return torch.cat([fc_points, conv_points], dim=1)
+
+
+def _deconv(inputs: int, outputs: int) -> nn.ConvTranspose2d:
+    return nn.ConvTranspose2d(inputs, outputs, 5, stride=2, padding=2, output_padding=1)
+
+
+def _crop(x: Tensor, like: Tensor) -> Tensor:
+    """Drops the last row or column where an odd side was halved and doubled."""
+    return x[..., : like.shape[-2], : like.shape[-1]]
+
+
+def _initialise(model: Generator) -> None:
+    """Keeps the second moment of activations through the layers, and starts clouds small, around the origin.
+
+    A layer followed by a ReLU gets variance 2 / fan-in. The layers whose outputs are summed before one ReLU
+    get half of it. With the defaults of torch the signal of the image fades through the trunk's eleven
+    layers.
+    """
+    decoder = model.decoder
+    summed = {decoder.up5, decoder.skip5, decoder.up4, decoder.skip4, decoder.skip3}
+    final = {decoder.fc_points, decoder.conv_points}
+    for module in model.modules():
+        if not isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
+            continue
+        gain = 0.01 if module in final else 1.0 if module in summed else 2.0
+        with torch.no_grad():
+            module.weight.normal_(0.0, math.sqrt(gain / _fan_in(module)))
+            if module.bias is not None:
+                module.bias.zero_()
+
+
+def _fan_in(module: nn.Conv2d | nn.ConvTranspose2d | nn.Linear) -> float:
+    """Inputs that reach one output value; strided transposed kernels reach it with a share of their taps."""
+    if isinstance(module, nn.Linear):
+        return module.in_features
+    taps = module.kernel_size[0] * module.kernel_size[1]
+    if isinstance(module, nn.ConvTranspose2d):
+        taps /= module.stride[0] * module.stride[1]
+    return module.in_channels * taps

@@ -1,0 +1,218 @@
+"""Every number of a run, in frozen dataclasses: profiles full (the paper), cpu (a laptop), smoke (tests).
+
+The resolved configuration is written beside every result. Units: distances in world units (an object is about
+one unit across); `front="emd"` is the paper's sum over matched points, `front="chamfer"` the mean chamfer
+distance x100.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from .errors import UserError
+
+Profile = Literal["full", "cpu", "smoke"]
+
+# The paper's alpha multiplies the released code's approximate EMD: a sum over 2048 points, about 1.3 times
+# the exact optimum. Ours is exact and a mean, so that it means the same at any number of points.
+EXACT_MEAN_EMD_FROM_PAPER = 2048 * 1.3
+
+
+@dataclasses.dataclass(frozen=True)
+class StageConfig:
+    """One stage of training. The stages differ in these values and in nothing else."""
+
+    steps: int
+    """Optimiser steps."""
+    shapes: int
+    """Different shapes in a batch."""
+    views: int
+    """Images per shape in a batch."""
+    codes: int
+    """Random codes per image (the paper's R)."""
+    joined_views: bool
+    """False: each image's cloud meets its own depth map. True: the clouds of a shape's views are concatenated
+    first and the whole meets the depth map of each view."""
+    front: Literal["emd", "chamfer"]
+    """Distance of the front constraint: earth mover's (sum over matched points) or chamfer (mean x100)."""
+    alpha: float
+    """The paper's alpha: how much a change of code must change the shape (in the unit of the released
+    code)."""
+    beta: float
+    """Weight of the diversity loss (the paper's beta)."""
+    diversity_images: int
+    """Images of the batch that take part in the diversity loss; fewer make a step cheaper."""
+    ramp: tuple[int, int]
+    """Steps between which the diversity weight rises from 0 to beta: the image has to speak before the
+    codes."""
+    select: Literal["cd", "fps_cd"]
+    """Validation figure by which the stage's best checkpoint is chosen."""
+    learning_rate: float = 1e-4
+    """Adam's step size after the warm-up."""
+    final_learning_rate: float = 1e-4
+    """Step size at the stage's end, reached along a cosine."""
+    warmup: int = 0
+    """Steps over which the learning rate rises from zero."""
+
+    @property
+    def exact_alpha(self) -> float:
+        """Alpha for the exact mean earth mover's distance."""
+        return self.alpha * EXACT_MEAN_EMD_FROM_PAPER
+
+    def diversity_weight(self, step: int) -> float:
+        """Beta at a step of this stage, ramp included."""
+        start, end = self.ramp
+        return self.beta * min(1.0, max(0.0, (step - start) / max(1, end - start)))
+
+
+@dataclasses.dataclass(frozen=True)
+class InferenceConfig:
+    """Algorithm 1: search over groups of codes, then plain gradient descent on them."""
+
+    groups: int = 5
+    """Groups of codes drawn per shape; the most consistent one is kept."""
+    steps: int = 30
+    """Gradient steps on the kept codes."""
+    step_size: float = 0.5
+    """Length factor of a gradient step; the loss is each shape's own mean pair distance x100."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FitConfig:
+    """A whole training run."""
+
+    stage1: StageConfig
+    """Single views."""
+    stage2: StageConfig
+    """Concatenated views, starting from stage 1's best checkpoint by validation."""
+    profile: Profile = "cpu"
+    """Size of the network: full 192 x 256 images and 2048 points, cpu 96 x 128 and 512, smoke 48 x 64 and
+    128."""
+    deterministic: bool = False
+    """Train the counterpart without random codes (one code per image, no diversity loss)."""
+    map_size: int = 28
+    """Side of the depth maps that the front constraint compares; the renders' side must be a multiple."""
+    gt_pool: Literal["decimate", "min"] = "decimate"
+    """How the renders' depth maps shrink: exact sub-sampling, or the paper's minimum over blocks."""
+    inference: InferenceConfig = InferenceConfig()
+    """Search and descent at test time."""
+    seed: int = 0
+    """Seeds weights, batches and codes."""
+    validate_every: int = 250
+    """Steps between validations (model selection)."""
+    validation_shapes: int = 32
+    """Shapes of the validation split that a validation uses, at most."""
+    checkpoint_every: int = 250
+    """Steps between checkpoints; a killed run loses at most these."""
+    health_every: int = 50
+    """Steps between measurements of what image and code do to the prediction."""
+    min_image_sensitivity: float = 0.15
+    """A run whose predictions of different images differ by less (chamfer x100) after `health_patience` steps
+    is stopped: its image trunk has died, whatever the loss says."""
+    health_patience: int = 600
+    """Steps of stage 1 that the image is given to start to matter."""
+    log_every: int = 10
+    """Steps between lines in metrics.jsonl."""
+
+    @property
+    def stages(self) -> tuple[StageConfig, StageConfig]:
+        """Both stages, as they are run: the deterministic counterpart has nothing to diversify."""
+        if not self.deterministic:
+            return self.stage1, self.stage2
+        plain = [dataclasses.replace(s, codes=1, beta=0.0) for s in (self.stage1, self.stage2)]
+        return plain[0], plain[1]
+
+
+_FULL_STAGE1 = StageConfig(
+    steps=40_000, shapes=2, views=8, codes=5, joined_views=False, front="emd", alpha=0.2, beta=10.0,
+    diversity_images=16, ramp=(1_000, 4_000), select="cd", warmup=500,
+)  # fmt: skip
+_FULL_STAGE2 = StageConfig(
+    steps=100_000, shapes=2, views=8, codes=5, joined_views=True, front="chamfer", alpha=0.1, beta=1.0,
+    diversity_images=16, ramp=(0, 1), select="fps_cd", warmup=500,
+)  # fmt: skip
+_CPU_STAGE1 = StageConfig(
+    steps=4_000, shapes=12, views=1, codes=4, joined_views=False, front="emd", alpha=0.2, beta=10.0,
+    diversity_images=6, ramp=(400, 1_200), select="cd", learning_rate=5e-4, final_learning_rate=1e-4,
+    warmup=200,
+)  # fmt: skip
+_CPU_STAGE2 = StageConfig(
+    steps=2_000, shapes=3, views=4, codes=4, joined_views=True, front="chamfer", alpha=0.1, beta=1.0,
+    diversity_images=6, ramp=(0, 1), select="fps_cd", learning_rate=3e-4, final_learning_rate=2e-5,
+    warmup=100,
+)  # fmt: skip
+_SMOKE_STAGE1 = dataclasses.replace(
+    _CPU_STAGE1, steps=30, shapes=3, views=1, codes=2, diversity_images=2, ramp=(5, 20), warmup=5
+)
+_SMOKE_STAGE2 = dataclasses.replace(
+    _CPU_STAGE2, steps=20, shapes=2, views=2, codes=2, diversity_images=2, warmup=5
+)
+
+PROFILES: dict[str, FitConfig] = {
+    "full": FitConfig(
+        _FULL_STAGE1, _FULL_STAGE2, "full", map_size=56, validate_every=2_000, validation_shapes=200,
+        checkpoint_every=1_000, health_every=500, health_patience=8_000,
+    ),
+    "cpu": FitConfig(_CPU_STAGE1, _CPU_STAGE2, "cpu"),
+    "smoke": FitConfig(
+        _SMOKE_STAGE1, _SMOKE_STAGE2, "smoke", map_size=16, inference=InferenceConfig(groups=2, steps=3),
+        validate_every=10, validation_shapes=4, checkpoint_every=10, health_every=10, health_patience=10_000,
+        log_every=1,
+    ),
+}  # fmt: skip
+
+
+def scaled(config: FitConfig, share: float) -> FitConfig:
+    """The same recipe with every duration (steps, ramps, warm-up, patience) multiplied by `share`."""
+
+    def shorten(stage: StageConfig) -> StageConfig:
+        def times(steps: int) -> int:
+            return max(1, round(steps * share))
+
+        ramp = (round(stage.ramp[0] * share), times(stage.ramp[1]))
+        return dataclasses.replace(
+            stage, steps=times(stage.steps), ramp=ramp, warmup=round(stage.warmup * share)
+        )
+
+    patience = max(1, round(config.health_patience * share))
+    return dataclasses.replace(
+        config, stage1=shorten(config.stage1), stage2=shorten(config.stage2), health_patience=patience
+    )
+
+
+def to_json(config: Any) -> str:
+    """A configuration as indented JSON."""
+    return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
+
+
+def fit_config_from_json(text: str, *, where: str) -> FitConfig:
+    """Reads what `to_json` wrote.
+
+    Args:
+        text: the JSON.
+        where: name of the file, for the error.
+    """
+    try:
+        return _build(FitConfig, json.loads(text))
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise UserError(
+            f"{where} is not the configuration of a run ({error}); was it written by `fit`?"
+        ) from None
+
+
+def _build(kind: type, values: Mapping[str, Any]) -> Any:
+    types = typing.get_type_hints(kind)
+    unknown = set(values) - set(types)
+    if unknown:
+        raise ValueError(f"unknown entries {sorted(unknown)}")
+
+    def convert(name: str, value: Any) -> Any:
+        if dataclasses.is_dataclass(types[name]):
+            return _build(types[name], value)
+        return tuple(value) if isinstance(value, list) else value
+
+    return kind(**{name: convert(name, value) for name, value in values.items()})

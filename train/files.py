@@ -1,0 +1,42 @@
+"""Writing so that a reader never sees half a file."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def replacing(target: Path) -> Iterator[Path]:
+    """Yields a temporary path beside `target`; what is written there becomes `target` on success.
+
+    The path may be made a file or a directory. An existing target file is replaced in one step; an existing
+    target directory is removed first, because a rename cannot replace one that is not empty.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")
+    try:
+        yield temporary
+        if target.is_dir():
+            shutil.rmtree(target)
+        os.replace(temporary, target)
+    finally:
+        remove(temporary)
+
+
+def write_text(target: Path, text: str) -> None:
+    """Writes a text file atomically."""
+    with replacing(target) as temporary:
+        temporary.write_text(text)
+
+
+def remove(path: Path) -> None:
+    """Deletes a file or a directory tree, if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
