@@ -1,0 +1,50 @@
+"""Differentiable point-cloud rendering and shape distances for PyTorch, fast on a plain CPU."""
+
+from diffpoint._runtime import RuntimeInfo, configure, runtime_info
+from diffpoint.camera import PinholeCamera, PointSets, Projection
+from diffpoint.distances import Chamfer, Nearest, chamfer_distance, nearest
+from diffpoint.losses import (
+    FrontSets,
+    consistency_loss,
+    diversity_loss,
+    front_constraint,
+    front_sets,
+    projection_loss,
+)
+from diffpoint.reproject import Reprojection, project, reproject, unproject
+from diffpoint.sampling import farthest_point_sample
+from diffpoint.splat import Splat, splat_depth
+from diffpoint.transport import Transport, earth_mover_distance
+from diffpoint.views import ViewSample, sample_view
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Chamfer",
+    "FrontSets",
+    "Nearest",
+    "PinholeCamera",
+    "PointSets",
+    "Projection",
+    "Reprojection",
+    "RuntimeInfo",
+    "Splat",
+    "Transport",
+    "ViewSample",
+    "chamfer_distance",
+    "configure",
+    "consistency_loss",
+    "diversity_loss",
+    "earth_mover_distance",
+    "farthest_point_sample",
+    "front_constraint",
+    "front_sets",
+    "nearest",
+    "project",
+    "projection_loss",
+    "reproject",
+    "runtime_info",
+    "sample_view",
+    "splat_depth",
+    "unproject",
+]

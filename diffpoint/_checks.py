@@ -1,0 +1,134 @@
+"""One style of error: `function: 'argument' must ...; got ...; how to mend it`."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from diffpoint.camera import PinholeCamera
+
+FLOATS = (torch.float32, torch.float64)
+
+
+def fail(function: str, argument: str, expected: str, got: str, hint: str = "") -> ValueError:
+    """The error every check raises, so that all of them read alike."""
+    return ValueError(f"{function}: '{argument}' must {expected}; got {got}." + (f" {hint}" if hint else ""))
+
+
+def check_tensor(function: str, name: str, value: Any, shape: tuple[int | str, ...]) -> Tensor:
+    """Type, device, dtype and shape of a float tensor. A string in `shape` is a free size; "*" any leading sizes."""
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{function}: '{name}' must be a torch.Tensor; got {type(value).__name__}.")
+    if value.dtype not in FLOATS:
+        raise TypeError(
+            f"{function}: '{name}' must be float32 or float64; got {value.dtype}. Convert it with .float()."
+        )
+    check_device(function, name, value)
+    check_shape(function, name, value, shape)
+    return value
+
+
+def check_device(function: str, name: str, value: Tensor) -> None:
+    if value.device.type not in ("cpu", "meta"):
+        raise ValueError(
+            f"{function}: '{name}' must be on the CPU; got device {value.device}. Move it with .cpu()."
+        )
+
+
+def check_shape(
+    function: str, name: str, value: Tensor, shape: tuple[int | str, ...], hint: str = ""
+) -> None:
+    free = shape[1:] if shape and shape[0] == "*" else shape
+    leading_ok = value.dim() >= len(free) if len(free) != len(shape) else value.dim() == len(free)
+    sizes = value.shape[value.dim() - len(free) :] if leading_ok else ()
+    if not leading_ok or any(isinstance(s, int) and s != n for s, n in zip(free, sizes, strict=True)):
+        wanted = "(" + ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
+        if not hint and value.dim() == len(shape) - 1:
+            hint = "Did you forget to batch? Add the leading dimension with [None]."
+        raise fail(function, name, f"have shape {wanted}", str(tuple(value.shape)), hint)
+
+
+def check_same_dtype(function: str, **tensors: Tensor) -> torch.dtype:
+    """All of them share one dtype."""
+    (first_name, first), *rest = tensors.items()
+    for name, value in rest:
+        if value.dtype != first.dtype:
+            raise TypeError(
+                f"{function}: '{name}' must have the dtype of '{first_name}' ({first.dtype}); got {value.dtype}."
+            )
+    return first.dtype
+
+
+def check_lengths(
+    function: str, name: str, lengths: Any, shape: tuple[int, ...], largest: int
+) -> Tensor | None:
+    """Lengths are integers of shape `shape` in [0, largest]; None means that every set is full."""
+    if lengths is None:
+        return None
+    if not isinstance(lengths, torch.Tensor) or lengths.dtype not in (torch.int64, torch.int32):
+        what = lengths.dtype if isinstance(lengths, torch.Tensor) else type(lengths).__name__
+        raise TypeError(f"{function}: '{name}' must be an integer tensor (int64); got {what}.")
+    check_device(function, name, lengths)
+    if tuple(lengths.shape) != tuple(shape):
+        raise fail(function, name, f"have shape {tuple(shape)}", str(tuple(lengths.shape)))
+    return lengths.to(torch.int64)
+
+
+def check_lengths_range(function: str, name: str, lengths: Tensor, largest: int, smallest: int = 0) -> None:
+    """Reads the values, so it belongs where the values exist (inside the op, not under a compiler's trace)."""
+    if lengths.numel() == 0:
+        return
+    low, high = (int(v) for v in torch.aminmax(lengths))
+    if low < smallest or high > largest:
+        at = int(((lengths < smallest) | (lengths > largest)).flatten().nonzero()[0])
+        got = int(lengths.flatten()[at])
+        hint = "An empty set has no distance to anything." if got == 0 and smallest == 1 else ""
+        raise fail(function, name, f"lie in [{smallest}, {largest}]", f"{got} at flat index {at}", hint)
+
+
+def check_finite(function: str, name: str, value: Tensor, lengths: Tensor | None = None) -> None:
+    """No NaN or infinity among the points that count. One sum first: only a suspect tensor is read twice."""
+    if value.numel() == 0 or math.isfinite(float(value.sum())):
+        return
+    bad = ~torch.isfinite(value)
+    if lengths is not None:
+        bad &= (torch.arange(value.shape[-2]) < lengths[..., None])[..., None]
+    if bool(bad.any()):
+        where = tuple(bad.nonzero()[0].tolist())
+        raise fail(
+            function,
+            name,
+            "be finite",
+            f"{float(value[where])} at index {where} ({int(bad.sum())} in all)",
+            "Look for a division by zero or an exploded update before this call.",
+        )
+
+
+def check_clouds(function: str, name: str, value: Any) -> Tensor:
+    """A batch of clouds (B, N, 3)."""
+    return check_tensor(function, name, value, ("B", "N", 3))
+
+
+def check_views(function: str, name: str, camera: PinholeCamera, batch: int) -> PinholeCamera:
+    """The camera with batch shape (batch, V): () and (V,) are shared by all clouds."""
+    shape = camera.batch_shape
+    if len(shape) > 2 or (len(shape) == 2 and shape[0] not in (1, batch)):
+        raise fail(
+            function,
+            name,
+            f"have batch shape (), (V,), (1, V) or ({batch}, V)",
+            str(tuple(shape)),
+            "One row of cameras per cloud.",
+        )
+    views = shape[-1] if shape else 1
+    return camera.expand(batch, views)
+
+
+def check_choice(function: str, name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise fail(function, name, "be one of " + ", ".join(repr(c) for c in choices), repr(value))

@@ -1,0 +1,182 @@
+"""Taichi's life: started on the first op and only if nobody has, never restarted, refused after a fork."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import io
+import os
+import sys
+import threading
+from dataclasses import dataclass
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+# Taichi runs a parallel loop of up to 512 iterations on one thread unless it was started with other settings.
+# In a host program's Taichi every loop is therefore stretched by this factor, and acts once per stretch.
+_HOST_SPREAD = 512
+
+
+@dataclass(frozen=True)
+class RuntimeInfo:
+    """What `runtime_info` returns."""
+
+    backend: str
+    """Module that compiles the kernels: taichi, or its fork quadrants."""
+    version: str
+    started: bool
+    """Whether an op has run, or the host program started Taichi."""
+    owner: str
+    """Who started Taichi: "diffpoint", "host" or "nobody"."""
+    threads: int
+    cache: bool
+    """Whether compiled kernels are kept on disk for the next process."""
+
+
+class _Runtime:
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.threads: int | None = None
+        self.cache = True
+        self.program: Any = None
+        self.forked = False
+        self.kernels: dict[tuple[str, str], SimpleNamespace] = {}
+
+    def backend(self) -> ModuleType:
+        name = os.environ.get("DIFFPOINT_BACKEND", "")
+        if name not in ("", "taichi", "quadrants"):
+            raise RuntimeError(f"diffpoint: DIFFPOINT_BACKEND must be 'taichi' or 'quadrants'; got {name!r}.")
+        return _quiet_import(name or _installed_backend())
+
+    def current_program(self) -> Any:
+        """The running Taichi program, whoever started it; None before any."""
+        backend = sys.modules.get("taichi") or sys.modules.get("quadrants")
+        return backend.lang.impl.get_runtime().prog if backend is not None else None
+
+    def ensure_started(self) -> int:
+        """Start Taichi if nobody has. Returns the spread factor of parallel loops."""
+        if self.forked:
+            raise RuntimeError(
+                "diffpoint: this process was forked after Taichi had started, and Taichi's threads do not survive a "
+                "fork. Start workers with 'spawn', e.g. DataLoader(..., multiprocessing_context='spawn'), or call no "
+                "diffpoint op in them."
+            )
+        program = self.current_program()
+        if program is None:
+            program = self._start()
+        return 1 if program is self.program else _HOST_SPREAD
+
+    def _start(self) -> Any:
+        ti = self.backend()
+        with contextlib.redirect_stdout(io.StringIO()):  # init announces itself on stdout
+            ti.init(
+                arch=ti.cpu,
+                log_level=ti.ERROR,
+                cpu_max_num_threads=self.threads or available_threads(),
+                offline_cache=self.cache,
+                # Even two iterations of a parallel loop are shared out among the threads.
+                make_cpu_multithreading_loop=False,
+                default_cpu_block_dim=1,
+            )
+        self.program = self.current_program()
+        return self.program
+
+    def kernel(self, module: str, real: str) -> SimpleNamespace:
+        """The kernels of `diffpoint.kernels.<module>` for "f32" or "f64"."""
+        key = (module, real)
+        if key not in self.kernels:
+            ti = self.backend()
+            self.kernels[key] = importlib.import_module(f"diffpoint.kernels.{module}").build(
+                getattr(ti, real)
+            )
+        return self.kernels[key]
+
+
+def _installed_backend() -> str:
+    for name in ("taichi", "quadrants"):
+        if name in sys.modules or importlib.util.find_spec(name) is not None:
+            return name
+    raise ImportError(
+        "diffpoint: neither taichi nor quadrants is installed. Install one: pip install taichi."
+    )
+
+
+def _quiet_import(name: str) -> ModuleType:
+    if name not in sys.modules:
+        os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+        os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # it would start a thread and use the network
+    return importlib.import_module(name)
+
+
+def available_threads() -> int:
+    """Cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+RUNTIME = _Runtime()
+
+
+def _mark_forked() -> None:
+    if RUNTIME.current_program() is not None:
+        RUNTIME.forked = True
+    RUNTIME.lock = threading.RLock()  # another thread of the parent may have held it
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_mark_forked)
+
+
+def configure(*, threads: int | None = None, cache: bool = True) -> None:
+    """Settings of the kernels' runtime; call it before the first op.
+
+    Args:
+        threads: how many threads the kernels use; None means every core this process may use.
+        cache: keep compiled kernels on disk, so that the next process starts in a fraction of a second.
+
+    Raises:
+        RuntimeError: an op has already started the kernels (Taichi cannot be started twice in a process).
+        ValueError: fewer than one thread.
+
+    Example:
+        >>> import subprocess, sys
+        >>> code = "import diffpoint; diffpoint.configure(threads=1); print(diffpoint.runtime_info().threads)"
+        >>> subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip()
+        '1'
+    """
+    if threads is not None and (not isinstance(threads, int) or isinstance(threads, bool) or threads < 1):
+        raise ValueError(f"configure: 'threads' must be a positive integer or None; got {threads!r}.")
+    with RUNTIME.lock:
+        if RUNTIME.program is not None:
+            raise RuntimeError(
+                "configure: the kernels have started already; call configure() before the first op."
+            )
+        RUNTIME.threads = threads
+        RUNTIME.cache = cache
+
+
+def runtime_info() -> RuntimeInfo:
+    """Which backend runs the kernels, who started it, and on how many threads.
+
+    Example:
+        >>> runtime_info().backend in ("taichi", "quadrants")
+        True
+    """
+    with RUNTIME.lock:
+        ti = RUNTIME.backend()
+        program = RUNTIME.current_program()
+        if program is None:
+            owner, threads = "nobody", RUNTIME.threads or available_threads()
+        else:
+            owner = "diffpoint" if program is RUNTIME.program else "host"
+            threads = int(ti.lang.impl.current_cfg().cpu_max_num_threads)
+        return RuntimeInfo(
+            backend=ti.__name__,
+            version=".".join(str(part) for part in ti.__version__),
+            started=program is not None,
+            owner=owner,
+            threads=threads,
+            cache=RUNTIME.cache,
+        )

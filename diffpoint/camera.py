@@ -1,0 +1,234 @@
+"""Pinhole cameras in the OpenCV convention, and the way between points and pixels."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffpoint import _checks
+
+_FLIP_YZ = ((1.0, 0, 0, 0), (0, -1.0, 0, 0), (0, 0, -1.0, 0), (0, 0, 0, 1.0))
+_FLIP_XY = ((-1.0, 0, 0, 0), (0, -1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, 1.0))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PinholeCamera:
+    """Cameras with intrinsics `K` (pixels) and extrinsics `cam_from_world`, for maps of height x width pixels.
+
+    Camera axes are OpenCV's: x right, y down, z forward; depth is z in this frame. Image coordinates are
+    continuous in [0, width] x [0, height]; pixel p covers [p, p + 1) and its centre is p + 0.5.
+
+    Attributes:
+        K: (..., 3, 3), last row (0, 0, 1), in pixels.
+        cam_from_world: (..., 4, 4), last row (0, 0, 0, 1), metric units of the world.
+        height: rows of the map.
+        width: columns of the map.
+
+    Gradients: every method is differentiable with respect to `K` and `cam_from_world`.
+
+    Raises:
+        ValueError: shapes, last rows or sizes that are no pinhole camera.
+        TypeError: not a tensor, or not float32 or float64.
+
+    Example:
+        >>> camera = PinholeCamera.look_at((0, 0, -2), (0, 0, 0), focal_px=420.0, height=224, width=224)
+        >>> camera.position.tolist()
+        [0.0, 0.0, -2.0]
+        >>> camera.resize(56, 56).K[0, 0].item()
+        105.0
+    """
+
+    K: Tensor
+    cam_from_world: Tensor
+    height: int
+    width: int
+
+    def __post_init__(self) -> None:
+        _checks.check_tensor("PinholeCamera", "K", self.K, ("*", 3, 3))
+        _checks.check_tensor("PinholeCamera", "cam_from_world", self.cam_from_world, ("*", 4, 4))
+        _checks.check_same_dtype("PinholeCamera", K=self.K, cam_from_world=self.cam_from_world)
+        for name in ("height", "width"):
+            size = getattr(self, name)
+            if not isinstance(size, int) or isinstance(size, bool) or size < 1:
+                raise _checks.fail("PinholeCamera", name, "be a positive integer", repr(size))
+        try:
+            torch.broadcast_shapes(self.K.shape[:-2], self.cam_from_world.shape[:-2])
+        except RuntimeError:
+            raise _checks.fail(
+                "PinholeCamera",
+                "cam_from_world",
+                f"have leading dimensions that fit those of 'K' {tuple(self.K.shape[:-2])}",
+                str(tuple(self.cam_from_world.shape[:-2])),
+            ) from None
+        if not torch.compiler.is_compiling():
+            self._check_last_rows()
+
+    def _check_last_rows(self) -> None:
+        for name, value in (("K", self.K), ("cam_from_world", self.cam_from_world)):
+            _checks.check_finite("PinholeCamera", name, value.detach())
+            row = value.detach()[..., -1, :]
+            wanted = torch.zeros_like(row)
+            wanted[..., -1] = 1
+            if not torch.allclose(row, wanted, atol=1e-5):
+                got = row.reshape(-1, row.shape[-1])[0].tolist()
+                hint = "Divide the matrix by its last entry, or transpose it." if got[-1] else ""
+                raise _checks.fail(
+                    "PinholeCamera",
+                    name,
+                    f"end in the row {wanted.reshape(-1, row.shape[-1])[0].tolist()}",
+                    str(got),
+                    hint,
+                )
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Tensor | tuple[float, float, float],
+        target: Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
+        *,
+        focal_px: float,
+        height: int,
+        width: int,
+        up: Tensor | tuple[float, float, float] = (0.0, 1.0, 0.0),
+    ) -> PinholeCamera:
+        """Cameras at `eye` (..., 3) that look at `target`, `up` pointing up in the image; centre in the middle.
+
+        Example:
+            >>> PinholeCamera.look_at((2.0, 0, 0), focal_px=100.0, height=8, width=8).cam_from_world[2].tolist()
+            [-1.0, -0.0, -0.0, 2.0]
+        """
+        eye = _vector("eye", eye)
+        target = _vector("target", target, eye)
+        up = _vector("up", up, eye)
+        eye, target, up = torch.broadcast_tensors(eye, target, up)
+        forward = target - eye
+        right = torch.linalg.cross(forward, up)
+        if bool((forward.norm(dim=-1) == 0).any()) or bool((right.norm(dim=-1) < 1e-9).any()):
+            raise _checks.fail(
+                "PinholeCamera.look_at",
+                "up",
+                "differ in direction from target - eye, and eye from target",
+                f"eye {eye.reshape(-1, 3)[0].tolist()}, target {target.reshape(-1, 3)[0].tolist()}",
+                "Choose another 'up', for instance (0, 0, 1) for a view from above.",
+            )
+        forward = forward / forward.norm(dim=-1, keepdim=True)
+        right = right / right.norm(dim=-1, keepdim=True)
+        down = torch.linalg.cross(forward, right)
+        rotation = torch.stack((right, down, forward), dim=-2)
+        cam_from_world = torch.zeros((*eye.shape[:-1], 4, 4), dtype=eye.dtype)
+        cam_from_world[..., :3, :3] = rotation
+        cam_from_world[..., :3, 3] = -(rotation @ eye[..., None])[..., 0]
+        cam_from_world[..., 3, 3] = 1
+        K = torch.tensor(
+            [[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]], dtype=eye.dtype
+        ).expand(*eye.shape[:-1], 3, 3)
+        return cls(K, cam_from_world, height, width)
+
+    @classmethod
+    def from_opengl(cls, K: Tensor, cam_from_world: Tensor, height: int, width: int) -> PinholeCamera:
+        """From an OpenGL or Blender view matrix (x right, y up, z backward). `K` as in OpenCV.
+
+        Example:
+            >>> gl = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]])  # eye at z = 2
+            >>> PinholeCamera.from_opengl(torch.eye(3), gl, 4, 4).position.tolist()
+            [0.0, 0.0, 2.0]
+        """
+        return cls(K, cam_from_world.new_tensor(_FLIP_YZ) @ cam_from_world, height, width)
+
+    @classmethod
+    def from_pytorch3d(cls, R: Tensor, T: Tensor, K: Tensor, height: int, width: int) -> PinholeCamera:
+        """From PyTorch3D's `R` (..., 3, 3), `T` (..., 3): X_view = X_world R + T, x left, y up, z forward.
+
+        `K` is the OpenCV matrix in pixels (`cameras_from_opencv_projection` is the way back).
+
+        Example:
+            >>> PinholeCamera.from_pytorch3d(torch.eye(3), torch.tensor([0.0, 0, 2]), torch.eye(3), 4, 4).position.tolist()
+            [0.0, 0.0, -2.0]
+        """
+        view_from_world = torch.zeros((*R.shape[:-2], 4, 4), dtype=R.dtype)
+        view_from_world[..., :3, :3] = R.transpose(-1, -2)
+        view_from_world[..., :3, 3] = T
+        view_from_world[..., 3, 3] = 1
+        return cls(K, R.new_tensor(_FLIP_XY) @ view_from_world, height, width)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading dimensions of the cameras: (), (V,) or (B, V)."""
+        return tuple(torch.broadcast_shapes(self.K.shape[:-2], self.cam_from_world.shape[:-2]))
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.K.dtype
+
+    @property
+    def position(self) -> Tensor:
+        """Optical centres in the world, (..., 3)."""
+        return torch.linalg.inv(self.cam_from_world)[..., :3, 3]
+
+    @property
+    def projection(self) -> Tensor:
+        """(..., 3, 4): (u d, v d, d) = projection @ (x, y, z, 1), with depth d, for world points."""
+        return self.K @ self.cam_from_world[..., :3, :]
+
+    @property
+    def back_projection(self) -> Tensor:
+        """(..., 3, 4): world point = d * (M[:, :3] @ (u, v, 1)) + M[:, 3] for the pixel position (u, v) at depth d."""
+        world_from_cam = torch.linalg.inv(self.cam_from_world)
+        rays = world_from_cam[..., :3, :3] @ torch.linalg.inv(self.K)
+        origin = world_from_cam[..., :3, 3:].expand(*rays.shape[:-1], 1)
+        return torch.cat((rays, origin), dim=-1)
+
+    def resize(self, height: int, width: int) -> PinholeCamera:
+        """The same view on a map of another size: K's first row times width ratio, the second times height ratio."""
+        scale = self.K.new_tensor([width / self.width, height / self.height, 1.0])
+        return PinholeCamera(self.K * scale[:, None], self.cam_from_world, height, width)
+
+    def to(self, *args, **kwargs) -> PinholeCamera:
+        """As `torch.Tensor.to`, on both matrices."""
+        return dataclasses.replace(
+            self, K=self.K.to(*args, **kwargs), cam_from_world=self.cam_from_world.to(*args, **kwargs)
+        )
+
+    def expand(self, *batch_shape: int) -> PinholeCamera:
+        """The same cameras with leading dimensions broadcast to `batch_shape`, without copying."""
+        return dataclasses.replace(
+            self,
+            K=self.K.expand(*batch_shape, 3, 3),
+            cam_from_world=self.cam_from_world.expand(*batch_shape, 4, 4),
+        )
+
+    def __getitem__(self, item) -> PinholeCamera:
+        """Index the leading dimensions."""
+        shape = self.batch_shape
+        if not shape:
+            raise IndexError("PinholeCamera: a single camera has no leading dimension to index.")
+        whole = self.expand(*shape)
+        return dataclasses.replace(self, K=whole.K[item], cam_from_world=whole.cam_from_world[item])
+
+
+def _vector(name: str, value, like: Tensor | None = None) -> Tensor:
+    if not isinstance(value, Tensor):
+        value = torch.tensor(value, dtype=torch.float32 if like is None else like.dtype)
+    value = _checks.check_tensor("PinholeCamera.look_at", name, value, ("*", 3))
+    return value if like is None else value.to(like.dtype)
+
+
+class Projection(NamedTuple):
+    """Image positions and depths of points."""
+
+    pixels: Tensor
+    """(B, V, N, 2) continuous image coordinates (u, v)."""
+    depth: Tensor
+    """(B, V, N) z in the camera frame; negative behind the camera."""
+
+
+class PointSets(NamedTuple):
+    """Point sets of different sizes, padded with zeros."""
+
+    points: Tensor
+    """(B, V, N, 3) world frame."""
+    lengths: Tensor
+    """(B, V) int64: how many of the N are points."""

@@ -1,0 +1,165 @@
+"""Nearest neighbours and the chamfer distance."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffpoint import _bridge, _checks
+
+
+class Nearest(NamedTuple):
+    """For each point of the first set, its nearest point of the second."""
+
+    squared_distance: Tensor
+    """(*B, N); 0 in the padding of `a`, +inf where `b` is empty."""
+    index: Tensor
+    """(*B, N) int64 into `b`; -1 in the padding of `a` and where `b` is empty."""
+
+
+class Chamfer(NamedTuple):
+    """Both directions of the chamfer distance, each a mean over its own set."""
+
+    a_to_b: Tensor
+    """(*B)"""
+    b_to_a: Tensor
+    """(*B)"""
+
+
+def nearest(
+    a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+) -> Nearest:
+    """d2_i = min_j |a_i - b_j|^2 and the j that attains it (the lowest of equals).
+
+    Args:
+        a: (*B, N, 3) points, any unit.
+        b: (*B, M, 3) points, same unit, dtype and leading dimensions.
+        a_lengths: (*B) int64, how many of the N points count; default all.
+        b_lengths: (*B) int64, how many of the M points count; default all.
+
+    Gradients: of `squared_distance` to `a` and `b`, with the assignment held fixed; zero in the padding.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, lengths out of range, NaN or infinite coordinates.
+
+    Example:
+        >>> a = torch.tensor([[0.0, 0, 0], [2, 0, 0]]); b = torch.tensor([[0.5, 0, 0]])
+        >>> nearest(a, b).squared_distance.tolist()
+        [0.25, 2.25]
+    """
+    a3, b3, la, lb, batch = paired_sets("nearest", a, b, a_lengths, b_lengths)
+    squared_distance, index = _nearest(a3, b3, la, lb, "nearest", 0)
+    return Nearest(squared_distance.reshape(a.shape[:-1]), index.reshape(a.shape[:-1]))
+
+
+def chamfer_distance(
+    a: Tensor, b: Tensor, *, squared: bool, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+) -> Chamfer:
+    """mean_i min_j |a_i - b_j| and mean_j min_i |a_i - b_j|, or the same of squared distances.
+
+    Papers differ in squares, sums and factors, so `squared` has no default and the directions are not added up.
+
+    Args:
+        a: (*B, N, 3) points, any unit.
+        b: (*B, M, 3) points, same unit, dtype and leading dimensions.
+        squared: True for squared distances (unit^2), False for distances (unit).
+        a_lengths: (*B) int64, how many of the N points count; default all.
+        b_lengths: (*B) int64, how many of the M points count; default all.
+
+    Gradients: to `a` and `b`, with the assignments held fixed; 0 for a pair at distance 0.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, an empty set, NaN or infinite coordinates.
+
+    Example:
+        >>> a = torch.zeros(1, 1, 3); b = torch.tensor([[[3.0, 4.0, 0.0], [0.0, 0.0, 1.0]]])
+        >>> [d.item() for d in chamfer_distance(a, b, squared=False)]
+        [1.0, 3.0]
+    """
+    a3, b3, la, lb, batch = paired_sets("chamfer_distance", a, b, a_lengths, b_lengths)
+    for name, cloud in (("a", a3), ("b", b3)):
+        if cloud.shape[1] == 0:
+            raise _checks.fail("chamfer_distance", name, "hold at least one point", str(tuple(cloud.shape)))
+    a_to_b = _mean_distance(_nearest(a3, b3, la, lb, "chamfer_distance", 1)[0], la, squared)
+    b_to_a = _mean_distance(_nearest(b3, a3, lb, la, "chamfer_distance", 1)[0], lb, squared)
+    return Chamfer(a_to_b.reshape(batch), b_to_a.reshape(batch))
+
+
+def _mean_distance(squared_distance: Tensor, lengths: Tensor, squared: bool) -> Tensor:
+    d = squared_distance if squared else safe_sqrt(squared_distance)
+    return d.sum(-1) / lengths  # the padding holds zeros
+
+
+def safe_sqrt(x: Tensor) -> Tensor:
+    """sqrt with gradient 0 instead of infinity at 0."""
+    positive = x > 0
+    return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)
+
+
+def paired_sets(
+    function: str, a: Tensor, b: Tensor, a_lengths: Tensor | None, b_lengths: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor, tuple[int, ...]]:
+    """Checked sets with one leading dimension, full lengths, and the leading dimensions to give back."""
+    _checks.check_tensor(function, "a", a, ("*", "N", 3))
+    batch = tuple(a.shape[:-2])
+    _checks.check_tensor(function, "b", b, ("*", "M", 3))
+    if b.shape[:-2] != a.shape[:-2]:
+        wanted = "(" + "".join(f"{s}, " for s in batch) + "M, 3) to match 'a'"
+        raise _checks.fail(
+            function, "b", f"have shape {wanted}", str(tuple(b.shape)), "Did you forget to batch?"
+        )
+    _checks.check_same_dtype(function, a=a, b=b)
+    la = _checks.check_lengths(function, "a_lengths", a_lengths, batch, a.shape[-2])
+    lb = _checks.check_lengths(function, "b_lengths", b_lengths, batch, b.shape[-2])
+    count = torch.Size(batch).numel()
+    a3, b3 = a.reshape(count, *a.shape[-2:]), b.reshape(count, *b.shape[-2:])
+    la = _bridge.full_lengths(la, count, a.shape[-2])
+    lb = _bridge.full_lengths(lb, count, b.shape[-2])
+    return a3, b3, la, lb, batch
+
+
+def _nearest_fake(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, caller: str, smallest: int):
+    return a.new_empty(a.shape[:2]), a.new_empty(a.shape[:2], dtype=torch.int64)
+
+
+def _nearest_setup(ctx, inputs, output) -> None:
+    a, b, *_ = inputs
+    ctx.mark_non_differentiable(output[1])
+    ctx.save_for_backward(a, b, output[1])
+
+
+def _nearest_gradient(ctx, grad_squared_distance: Tensor, _grad_index):
+    grad_a, grad_b = _nearest_backward(*ctx.saved_tensors, grad_squared_distance)
+    return grad_a, grad_b, None, None, None, None
+
+
+@_bridge.register("nearest", fake=_nearest_fake, backward=_nearest_gradient, setup=_nearest_setup)
+def _nearest(
+    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, caller: str, smallest: int
+) -> tuple[Tensor, Tensor]:
+    for name, cloud, lengths in (("a", a, a_lengths), ("b", b, b_lengths)):
+        _checks.check_lengths_range(caller, f"{name}_lengths", lengths, cloud.shape[1], smallest)
+        _checks.check_finite(caller, name, cloud, lengths)
+    squared_distance = a.new_empty(a.shape[:2])
+    index = a.new_empty(a.shape[:2], dtype=torch.int64)
+    if b.shape[1] == 0:
+        squared_distance.fill_(torch.inf)
+        index.fill_(-1)
+    elif a.numel():
+        _bridge.launch("nearest", "forward", a.dtype, a, b, a_lengths, b_lengths, squared_distance, index)
+    return squared_distance, index
+
+
+@_bridge.register(
+    "nearest_backward",
+    fake=lambda a, b, index, grad_squared_distance: (a.new_empty(a.shape), b.new_empty(b.shape)),
+)
+def _nearest_backward(
+    a: Tensor, b: Tensor, index: Tensor, grad_squared_distance: Tensor
+) -> tuple[Tensor, Tensor]:
+    grad_a, grad_b = a.new_zeros(a.shape), b.new_zeros(b.shape)
+    if a.numel() and b.numel():
+        _bridge.launch("nearest", "backward", a.dtype, a, b, index, grad_squared_distance, grad_a, grad_b)
+    return grad_a, grad_b

@@ -1,0 +1,149 @@
+"""Points to pixels and depth, and depth maps to points, with gradients to points, depth and camera matrices."""
+
+from types import SimpleNamespace
+
+from diffpoint.kernels._backend import ti
+
+
+def build(real):
+    points3 = ti.types.ndarray(dtype=real, ndim=3)
+    maps3 = ti.types.ndarray(dtype=real, ndim=3)
+    matrices2 = ti.types.ndarray(dtype=real, ndim=2)
+    integers = ti.types.ndarray(dtype=ti.i64, ndim=1)
+    values2 = ti.types.ndarray(dtype=real, ndim=2)
+
+    @ti.kernel
+    def project(
+        points: points3, projection: matrices2, pixels: points3, depth: values2, views: ti.i32, spread: ti.i32
+    ):
+        for step in range(projection.shape[0] * spread):
+            if step % spread == 0:
+                view = step // spread
+                cloud = view // views
+                m = ti.Vector([projection[view, e] for e in ti.static(range(12))])
+                for i in range(points.shape[1]):
+                    x = points[cloud, i, 0]
+                    y = points[cloud, i, 1]
+                    z = points[cloud, i, 2]
+                    d = m[8] * x + m[9] * y + m[10] * z + m[11]
+                    u = real(ti.math.inf)
+                    v = real(ti.math.inf)
+                    if d > 0:
+                        u = (m[0] * x + m[1] * y + m[2] * z + m[3]) / d
+                        v = (m[4] * x + m[5] * y + m[6] * z + m[7]) / d
+                    pixels[view, i, 0] = u
+                    pixels[view, i, 1] = v
+                    depth[view, i] = d
+
+    @ti.kernel
+    def project_backward(
+        points: points3,
+        projection: matrices2,
+        grad_pixels: points3,
+        grad_depth: values2,
+        grad_points: points3,
+        grad_projection: matrices2,
+        views: ti.i32,
+        spread: ti.i32,
+    ):
+        for step in range(points.shape[0] * spread):
+            if step % spread == 0:
+                cloud = step // spread
+                for view in range(cloud * views, cloud * views + views):
+                    m = ti.Vector([projection[view, e] for e in ti.static(range(12))])
+                    total = ti.Vector([real(0.0) for e in ti.static(range(12))])
+                    for i in range(points.shape[1]):
+                        p = ti.Vector(
+                            [points[cloud, i, 0], points[cloud, i, 1], points[cloud, i, 2], real(1.0)]
+                        )
+                        d = m[8] * p[0] + m[9] * p[1] + m[10] * p[2] + m[11]
+                        # Gradients of the three rows' products with (x, y, z, 1): (u d, v d, d).
+                        g0 = real(0.0)
+                        g1 = real(0.0)
+                        g2 = grad_depth[view, i]
+                        if d > 0:
+                            u = (m[0] * p[0] + m[1] * p[1] + m[2] * p[2] + m[3]) / d
+                            v = (m[4] * p[0] + m[5] * p[1] + m[6] * p[2] + m[7]) / d
+                            g0 = grad_pixels[view, i, 0] / d
+                            g1 = grad_pixels[view, i, 1] / d
+                            g2 -= g0 * u + g1 * v
+                        for k in ti.static(range(3)):
+                            grad_points[cloud, i, k] += g0 * m[k] + g1 * m[4 + k] + g2 * m[8 + k]
+                        for k in ti.static(range(4)):
+                            total[k] += g0 * p[k]
+                            total[4 + k] += g1 * p[k]
+                            total[8 + k] += g2 * p[k]
+                    for e in ti.static(range(12)):
+                        grad_projection[view, e] = total[e]
+
+    @ti.kernel
+    def unproject(
+        depth: maps3,
+        back_projection: matrices2,
+        points: points3,
+        lengths: integers,
+        compact: ti.i32,
+        spread: ti.i32,
+    ):
+        """Pixel centres at their depth. With `compact` the foreground comes first; else every pixel keeps its place."""
+        for step in range(depth.shape[0] * spread):
+            if step % spread == 0:
+                view = step // spread
+                m = ti.Vector([back_projection[view, e] for e in ti.static(range(12))])
+                count = 0
+                for row in range(depth.shape[1]):
+                    v = ti.cast(row, real) + real(0.5)
+                    for column in range(depth.shape[2]):
+                        d = depth[view, row, column]
+                        slot = ti.select(compact != 0, count, row * depth.shape[2] + column)
+                        if d < ti.math.inf:
+                            u = ti.cast(column, real) + real(0.5)
+                            for k in ti.static(range(3)):
+                                points[view, slot, k] = (
+                                    d * (m[4 * k] * u + m[4 * k + 1] * v + m[4 * k + 2]) + m[4 * k + 3]
+                                )
+                            count += 1
+                lengths[view] = count
+
+    @ti.kernel
+    def unproject_backward(
+        depth: maps3,
+        back_projection: matrices2,
+        grad_points: points3,
+        grad_depth: maps3,
+        grad_back_projection: matrices2,
+        compact: ti.i32,
+        spread: ti.i32,
+    ):
+        for step in range(depth.shape[0] * spread):
+            if step % spread == 0:
+                view = step // spread
+                m = ti.Vector([back_projection[view, e] for e in ti.static(range(12))])
+                total = ti.Vector([real(0.0) for e in ti.static(range(12))])
+                count = 0
+                for row in range(depth.shape[1]):
+                    v = ti.cast(row, real) + real(0.5)
+                    for column in range(depth.shape[2]):
+                        d = depth[view, row, column]
+                        slot = ti.select(compact != 0, count, row * depth.shape[2] + column)
+                        g_depth = real(0.0)
+                        if d < ti.math.inf:
+                            u = ti.cast(column, real) + real(0.5)
+                            for k in ti.static(range(3)):
+                                g = grad_points[view, slot, k]
+                                g_depth += g * (m[4 * k] * u + m[4 * k + 1] * v + m[4 * k + 2])
+                                total[4 * k] += g * d * u
+                                total[4 * k + 1] += g * d * v
+                                total[4 * k + 2] += g * d
+                                total[4 * k + 3] += g
+                            count += 1
+                        grad_depth[view, row, column] = g_depth
+                for e in ti.static(range(12)):
+                    grad_back_projection[view, e] = total[e]
+
+    return SimpleNamespace(
+        project=project,
+        project_backward=project_backward,
+        unproject=unproject,
+        unproject_backward=unproject_backward,
+    )

@@ -1,0 +1,267 @@
+"""Between points, pixels and depth maps: project, unproject, reproject."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffpoint import _bridge, _checks
+from diffpoint.camera import PinholeCamera, PointSets, Projection
+
+
+class Reprojection(NamedTuple):
+    """Where the pixels of one camera's depth map are seen by another camera."""
+
+    points: Tensor
+    """(B, V, H, W, 3) world frame; zeros where the source is empty."""
+    pixels: Tensor
+    """(B, V, H, W, 2) continuous image coordinates in the target; +inf where there are none."""
+    depth: Tensor
+    """(B, V, H, W) z in the target's camera frame; +inf where the source is empty."""
+    valid: Tensor
+    """(B, V, H, W) bool: the source pixel is foreground, and lies before the target inside its image."""
+
+
+def project(points: Tensor, camera: PinholeCamera) -> Projection:
+    """(u d, v d, d) = K cam_from_world (x, y, z, 1).
+
+    Args:
+        points: (B, N, 3) in the world.
+        camera: batch shape (), (V,) or (B, V).
+
+    Returns:
+        `Projection`. Points at or behind the camera's plane have no image: their pixels are +inf.
+
+    Gradients: to `points`, `camera.K` and `camera.cam_from_world`; zero for pixels at infinity.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, NaN or infinite coordinates.
+
+    Example:
+        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
+        >>> project(torch.zeros(1, 1, 3), camera).pixels.tolist()
+        [[[[2.0, 2.0]]]]
+    """
+    _checks.check_clouds("project", "points", points)
+    _checks.check_same_dtype("project", points=points, camera=camera.K)
+    views = _checks.check_views("project", "camera", camera, points.shape[0])
+    return Projection(*_project(points, views.projection, "project"))
+
+
+def unproject(depth: Tensor, camera: PinholeCamera) -> PointSets:
+    """The world points at the pixel centres of depth maps, foreground only.
+
+    Args:
+        depth: (B, V, H, W) z in the camera frame, +inf where empty.
+        camera: batch shape (), (V,) or (B, V), of the maps' size.
+
+    Returns:
+        `PointSets` of points (B, V, H*W, 3): the foreground in row-major order, then zeros; and its lengths (B, V).
+
+    Gradients: to `depth`, `camera.K` and `camera.cam_from_world`.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, depths that are NaN, zero or negative.
+
+    Example:
+        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=1, width=1)
+        >>> unproject(torch.full((1, 1, 1, 1), 2.0), camera).points.tolist()
+        [[[[0.0, 0.0, 0.0]]]]
+    """
+    views = _depth_views("unproject", depth, "camera", camera)
+    return PointSets(*_unproject(depth, views.back_projection, True, "unproject"))
+
+
+def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Reprojection:
+    """Depth maps of `source` -> world points -> pixels and depth in `target`, pixel by pixel.
+
+    Args:
+        depth: (B, V, H, W) z in the source's camera frame, +inf where empty.
+        source: cameras of the maps, batch shape (), (V,) or (B, V), of the maps' size.
+        target: cameras to look from, view v of it beside view v of `source`.
+
+    Gradients: of points, pixels and depth to `depth` and both cameras.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, depths that are NaN, zero or negative.
+
+    Example:
+        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=1, width=1)
+        >>> reproject(torch.full((1, 1, 1, 1), 2.0), camera, camera).pixels.tolist()
+        [[[[[0.5, 0.5]]]]]
+    """
+    views = _depth_views("reproject", depth, "source", source)
+    _checks.check_same_dtype("reproject", depth=depth, target=target.K)
+    batch, count, height, width = depth.shape
+    targets = _checks.check_views("reproject", "target", target, batch)
+    if targets.batch_shape[1] not in (1, count):
+        raise _checks.fail(
+            "reproject", "target", f"have {count} views to match 'depth'", str(targets.batch_shape[1])
+        )
+    targets = targets.expand(batch, count)
+    points, _ = _unproject(depth, views.back_projection, False, "reproject")
+    flat = batch * count
+    pixels, seen_depth = _project(
+        points.reshape(flat, height * width, 3), targets.projection.reshape(flat, 1, 3, 4), "reproject"
+    )
+    pixels = pixels.reshape(batch, count, height, width, 2)
+    seen_depth = seen_depth.reshape(depth.shape)
+    foreground = torch.isfinite(depth)
+    u, v = pixels.unbind(-1)
+    inside = (u >= 0) & (u < target.width) & (v >= 0) & (v < target.height) & (seen_depth > 0)
+    return Reprojection(
+        points=points.reshape(batch, count, height, width, 3),
+        pixels=torch.where(foreground[..., None], pixels, torch.inf),
+        depth=torch.where(foreground, seen_depth, torch.inf),
+        valid=foreground & inside,
+    )
+
+
+def _depth_views(function: str, depth: Tensor, name: str, camera: PinholeCamera) -> PinholeCamera:
+    """The camera expanded to the (B, V) of the depth maps, of their size and dtype."""
+    _checks.check_tensor(function, "depth", depth, ("B", "V", "H", "W"))
+    _checks.check_same_dtype(function, depth=depth, **{name: camera.K})
+    batch, count, height, width = depth.shape
+    if (height, width) != (camera.height, camera.width):
+        raise _checks.fail(
+            function,
+            "depth",
+            f"have the camera's size {camera.height} x {camera.width}",
+            f"{height} x {width}",
+            "Use camera.resize(height, width) if the map shows the same view at another size.",
+        )
+    views = _checks.check_views(function, name, camera, batch)
+    if views.batch_shape[1] not in (1, count):
+        raise _checks.fail(function, name, f"have {count} views to match 'depth'", str(views.batch_shape[1]))
+    return views.expand(batch, count)
+
+
+def _project_fake(points: Tensor, projection: Tensor, caller: str):
+    shape = (*projection.shape[:2], points.shape[1])
+    return points.new_empty((*shape, 2)), points.new_empty(shape)
+
+
+def _project_setup(ctx, inputs, output) -> None:
+    ctx.save_for_backward(inputs[0], inputs[1])
+
+
+def _project_gradient(ctx, grad_pixels: Tensor, grad_depth: Tensor):
+    return *_project_backward(*ctx.saved_tensors, grad_pixels, grad_depth), None
+
+
+@_bridge.register("project", fake=_project_fake, backward=_project_gradient, setup=_project_setup)
+def _project(points: Tensor, projection: Tensor, caller: str) -> tuple[Tensor, Tensor]:
+    _checks.check_finite(caller, "points", points)
+    batch, views = projection.shape[:2]
+    pixels = points.new_empty((batch * views, points.shape[1], 2))
+    depth = points.new_empty((batch * views, points.shape[1]))
+    if depth.numel():
+        cameras = projection.reshape(batch * views, 12)
+        _bridge.launch("reproject", "project", points.dtype, points, cameras, pixels, depth, views)
+    return pixels.view(batch, views, -1, 2), depth.view(batch, views, -1)
+
+
+@_bridge.register(
+    "project_backward",
+    fake=lambda points, projection, grad_pixels, grad_depth: (
+        points.new_empty(points.shape),
+        projection.new_empty(projection.shape),
+    ),
+)
+def _project_backward(
+    points: Tensor, projection: Tensor, grad_pixels: Tensor, grad_depth: Tensor
+) -> tuple[Tensor, Tensor]:
+    batch, views = projection.shape[:2]
+    flat, count = batch * views, points.shape[1]
+    grad_points = points.new_zeros(points.shape)
+    grad_projection = projection.new_zeros((flat, 12))
+    if points.numel() and flat:
+        _bridge.launch(
+            "reproject",
+            "project_backward",
+            points.dtype,
+            points,
+            projection.reshape(flat, 12),
+            grad_pixels.reshape(flat, count, 2),
+            grad_depth.reshape(flat, count),
+            grad_points,
+            grad_projection,
+            views,
+        )
+    return grad_points, grad_projection.view(batch, views, 3, 4)
+
+
+def _unproject_fake(depth: Tensor, back_projection: Tensor, compact: bool, caller: str):
+    batch, views, height, width = depth.shape
+    return (
+        depth.new_empty((batch, views, height * width, 3)),
+        depth.new_empty((batch, views), dtype=torch.int64),
+    )
+
+
+def _unproject_setup(ctx, inputs, output) -> None:
+    ctx.mark_non_differentiable(output[1])
+    ctx.save_for_backward(inputs[0], inputs[1])
+    ctx.compact = inputs[2]
+
+
+def _unproject_gradient(ctx, grad_points: Tensor, _grad_lengths):
+    return *_unproject_backward(*ctx.saved_tensors, grad_points, ctx.compact), None, None
+
+
+@_bridge.register("unproject", fake=_unproject_fake, backward=_unproject_gradient, setup=_unproject_setup)
+def _unproject(depth: Tensor, back_projection: Tensor, compact: bool, caller: str) -> tuple[Tensor, Tensor]:
+    batch, views, height, width = depth.shape
+    check_depth(caller, "depth", depth)
+    points = depth.new_zeros((batch * views, height * width, 3))
+    lengths = torch.zeros(batch * views, dtype=torch.int64)
+    if depth.numel():
+        maps = depth.reshape(batch * views, height, width)
+        matrices = back_projection.reshape(batch * views, 12)
+        _bridge.launch("reproject", "unproject", depth.dtype, maps, matrices, points, lengths, int(compact))
+    return points.view(batch, views, -1, 3), lengths.view(batch, views)
+
+
+@_bridge.register(
+    "unproject_backward",
+    fake=lambda depth, back_projection, grad_points, compact: (
+        depth.new_empty(depth.shape),
+        back_projection.new_empty(back_projection.shape),
+    ),
+)
+def _unproject_backward(
+    depth: Tensor, back_projection: Tensor, grad_points: Tensor, compact: bool
+) -> tuple[Tensor, Tensor]:
+    batch, views, height, width = depth.shape
+    flat = batch * views
+    grad_depth = depth.new_zeros((flat, height, width))
+    grad_back_projection = back_projection.new_zeros((flat, 12))
+    if depth.numel():
+        _bridge.launch(
+            "reproject",
+            "unproject_backward",
+            depth.dtype,
+            depth.reshape(flat, height, width),
+            back_projection.reshape(flat, 12),
+            grad_points.reshape(flat, height * width, 3),
+            grad_depth,
+            grad_back_projection,
+            int(compact),
+        )
+    return grad_depth.view(depth.shape), grad_back_projection.view(back_projection.shape)
+
+
+def check_depth(function: str, name: str, depth: Tensor) -> None:
+    """Depth maps hold positive numbers, and +inf where they are empty."""
+    good = depth > 0
+    if not bool(good.all()):
+        where = tuple((~good).nonzero()[0].tolist())
+        raise _checks.fail(
+            function,
+            name,
+            "be positive, and +inf where empty",
+            f"{float(depth[where])} at index {where}",
+            "If 0 marks empty pixels: depth.masked_fill(depth == 0, float('inf')).",
+        )

@@ -1,0 +1,81 @@
+"""Farthest point sampling."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from diffpoint import _bridge, _checks
+
+_LANES = 16  # as in kernels/sampling.py
+
+
+def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Tensor | None = None) -> Tensor:
+    """Indices of k points, each the farthest from those before it.
+
+    Args:
+        points: (*B, N, 3), any unit.
+        k: how many, at most the size of the smallest cloud.
+        start: index of the first.
+        lengths: (*B) int64, how many of the N points count; default all.
+
+    Returns:
+        (*B, k) int64. Equal distances go to the lowest index: the same input gives the same indices.
+
+    Gradients: none; gather the points with the result to pass gradients to them.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, k or start out of range, NaN or infinite coordinates.
+
+    Example:
+        >>> farthest_point_sample(torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2).tolist()
+        [0, 2]
+    """
+    _checks.check_tensor("farthest_point_sample", "points", points, ("*", "N", 3))
+    batch = tuple(points.shape[:-2])
+    lengths = _checks.check_lengths("farthest_point_sample", "lengths", lengths, batch, points.shape[-2])
+    for name, value, lowest in (("k", k, 0), ("start", start, 0)):
+        if not isinstance(value, int) or isinstance(value, bool) or value < lowest:
+            raise _checks.fail(
+                "farthest_point_sample", name, f"be an integer of at least {lowest}", repr(value)
+            )
+    flat = points.reshape(torch.Size(batch).numel(), *points.shape[-2:])
+    lengths = _bridge.full_lengths(lengths, flat.shape[0], flat.shape[1])
+    return _farthest(flat, lengths, k, start).reshape(*batch, k)
+
+
+@_bridge.register(
+    "farthest_point_sample",
+    fake=lambda points, lengths, k, start: points.new_empty((points.shape[0], k), dtype=torch.int64),
+)
+def _farthest(points: Tensor, lengths: Tensor, k: int, start: int) -> Tensor:
+    batch, size, _ = points.shape
+    smallest = int(lengths.min()) if batch else size
+    _checks.check_lengths_range("farthest_point_sample", "lengths", lengths, size)
+    for name, value, limit in (("k", k, smallest), ("start", start, max(smallest - 1, 0))):
+        if value > limit and batch:
+            raise _checks.fail(
+                "farthest_point_sample",
+                name,
+                f"be at most {limit} (the smallest cloud has {smallest} points)",
+                str(value),
+            )
+    _checks.check_finite("farthest_point_sample", "points", points, lengths)
+    chosen = torch.empty((batch, k), dtype=torch.int64)
+    if chosen.numel() == 0:
+        return chosen
+    axes = lanes(points)
+    counts = torch.arange(axes[0].shape[1] * _LANES) < lengths[:, None]
+    distance = torch.where(counts, torch.inf, -1.0).to(points.dtype).view(axes[0].shape)
+    _bridge.launch("sampling", "farthest", points.dtype, points, *axes, distance, chosen, start)
+    return chosen
+
+
+def lanes(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y and z of clouds (B, N, 3), each as (B, ceil(N / 16), 16) for kernels that load whole vectors."""
+    batch, size, _ = points.shape
+    tiles = -(-size // _LANES)
+    by_axis = pad(points.detach().movedim(-1, 0), (0, tiles * _LANES - size)).contiguous()
+    x, y, z = by_axis.view(3, batch, tiles, _LANES)
+    return x, y, z

@@ -1,0 +1,127 @@
+"""View based sampling: the points of a cloud that contribute to a view, with their gradient."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffpoint import _bridge, _checks
+from diffpoint.splat import Splat
+
+
+class ViewSample(NamedTuple):
+    """The points each view sees, padded to the largest count M."""
+
+    points: Tensor
+    """(B, V, M, 3) world frame, in the cloud's order; zeros in the padding."""
+    index: Tensor
+    """(B, V, M) int64 into the cloud; -1 in the padding."""
+    lengths: Tensor
+    """(B, V) int64."""
+
+
+def sample_view(points: Tensor, splat: Splat) -> ViewSample:
+    """Gather the points that own a pixel of each view.
+
+    Args:
+        points: (B, N, 3) in the world, those that `splat` was rendered from.
+        splat: the result of `splat_depth`.
+
+    Returns:
+        `ViewSample`; a view that no point falls into has length 0.
+
+    Gradients: of `points` to x, y and z of the chosen points; none through the choice.
+
+    Raises:
+        ValueError, TypeError: `points` and `splat` of different sizes, wrong dtype or device.
+
+    Source: CVPR 2019 paper, section 3.2.
+
+    Example:
+        >>> from diffpoint import PinholeCamera, splat_depth
+        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
+        >>> cloud = torch.tensor([[[0.1, -0.1, 0.5], [0.1, -0.1, 0.0]]])
+        >>> sample_view(cloud, splat_depth(cloud, camera)).index.tolist()
+        [[[1]]]
+    """
+    _checks.check_clouds("sample_view", "points", points)
+    if not isinstance(splat, Splat):
+        raise TypeError(
+            f"sample_view: 'splat' must be the result of splat_depth; got {type(splat).__name__}."
+        )
+    batch, views, count = splat.visible.shape
+    if (batch, count) != tuple(points.shape[:2]):
+        raise _checks.fail(
+            "sample_view",
+            "points",
+            f"have shape ({batch}, {count}, 3) to match 'splat'",
+            str(tuple(points.shape)),
+            "Pass the cloud that splat_depth rendered.",
+        )
+    return ViewSample(*_sample_view(points, splat.visible))
+
+
+def _sample_fake(points: Tensor, visible: Tensor):
+    largest = torch.library.get_ctx().new_dynamic_size()
+    shape = (*visible.shape[:2], largest)
+    integers = {"dtype": torch.int64}
+    return (
+        points.new_empty((*shape, 3)),
+        points.new_empty(shape, **integers),
+        points.new_empty(shape[:2], **integers),
+    )
+
+
+def _sample_setup(ctx, inputs, output) -> None:
+    ctx.mark_non_differentiable(output[1], output[2])
+    ctx.save_for_backward(output[1])
+    ctx.count = inputs[0].shape[1]
+
+
+def _sample_gradient(ctx, grad_points: Tensor, _grad_index, _grad_lengths):
+    return _sample_view_backward(ctx.saved_tensors[0], grad_points, ctx.count), None
+
+
+@_bridge.register("sample_view", fake=_sample_fake, backward=_sample_gradient, setup=_sample_setup)
+def _sample_view(points: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    batch, views, count = visible.shape
+    lengths = visible.sum(-1)
+    largest = int(lengths.max()) if lengths.numel() else 0
+    sampled = points.new_zeros((batch, views, largest, 3))
+    index = torch.full((batch, views, largest), -1, dtype=torch.int64)
+    if sampled.numel():
+        flat = batch * views
+        _bridge.launch(
+            "splat",
+            "gather_visible",
+            points.dtype,
+            points,
+            visible.view(torch.uint8).reshape(flat, count),
+            sampled.view(flat, largest, 3),
+            index.view(flat, largest),
+            views,
+        )
+    return sampled, index, lengths
+
+
+@_bridge.register(
+    "sample_view_backward",
+    fake=lambda index, grad_sampled, count: grad_sampled.new_empty((index.shape[0], count, 3)),
+)
+def _sample_view_backward(index: Tensor, grad_sampled: Tensor, count: int) -> Tensor:
+    batch, views, largest = index.shape
+    grad_points = grad_sampled.new_zeros((batch, count, 3))
+    if index.numel():
+        flat = batch * views
+        _bridge.launch(
+            "splat",
+            "scatter_visible",
+            grad_sampled.dtype,
+            index.view(flat, largest),
+            grad_sampled.reshape(flat, largest, 3),
+            grad_points,
+            views,
+        )
+    return grad_points
