@@ -1,0 +1,223 @@
+"""Seeded shapes with designed ambiguity: several backs for one front. The families are in `families.py`."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from train.data import store
+from train.data.categories import SYNSET_OF
+from train.data.families import FAMILIES, FRONT_AZIMUTH_DEG, FRONT_ELEVATION_DEG, MODES
+from train.data.render import MAX_RADIUS, Renderer, Views, draw_camera, orbit_camera
+from train.data.solids import Solid, sample_union, surface_of
+from train.data.work import run_all
+from train.errors import UserError
+
+_JUDGED_SIZE = 112
+_SAME_DEPTH, _SAME_COLOUR = 1e-3, 3  # world units; steps of 255
+_ATTEMPTS = 60
+
+
+@dataclasses.dataclass(frozen=True)
+class Ambiguity:
+    """How well one front hides several backs; the worst pair of variants decides.
+
+    Attributes:
+        front: share of the object's pixels that differ between two variants, seen from the front.
+        back: the same, seen from behind.
+        separation: chamfer distance between two variants, over that between two samplings of one.
+        radius: of the largest variant, world units.
+    """
+
+    front: float
+    back: float
+    separation: float
+    radius: float
+
+    @property
+    def accepted(self) -> bool:
+        """The same front, other backs, modes that can be told apart, and nothing that a frame would cut."""
+        return self.front < 0.01 and self.back > 0.1 and self.separation >= 2 and self.radius <= MAX_RADIUS
+
+
+@dataclasses.dataclass(frozen=True)
+class ProceduralReport:
+    """What `generate` did."""
+
+    out: Path
+    made: int
+    kept: int
+    categories: tuple[str, ...]
+    counts: dict[str, int]
+    failures: dict[str, str]
+
+    def summary(self) -> str:
+        """A line for the terminal."""
+        splits = ", ".join(f"{count} {split}" for split, count in self.counts.items())
+        earlier = f", {self.kept} were there" if self.kept else ""
+        failed = (
+            f"; {len(self.failures)} failed: {'; '.join(self.failures.values())}" if self.failures else ""
+        )
+        return (
+            f"{self.out}: made {self.made} shapes{earlier} of {', '.join(self.categories)} ({splits}){failed}"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Job:
+    out: Path
+    category: str
+    index: int
+    seed: int
+    size: int
+    views: int
+    variants: int
+
+    def shape(self, mode: int) -> str:
+        return f"{SYNSET_OF[self.category]}/{self.category}_s{self.seed}_{self.index:06d}_h{mode}"
+
+
+def variants_of(category: str, seed: int | Sequence[int]) -> tuple[list[Solid], ...]:
+    """The hidden variants of one object, one for each mode: equal in front, different behind.
+
+    Objects are drawn until one passes `ambiguity`; the same seed always gives the same variants.
+    """
+    entropy = [seed] if isinstance(seed, int) else list(seed)
+    number = list(FAMILIES).index(category)
+    for attempt in range(_ATTEMPTS):
+        visible, *hidden = (
+            functools.partial(np.random.default_rng, [*entropy, number, attempt, stream])
+            for stream in range(MODES + 1)
+        )
+        variants = tuple(FAMILIES[category](visible(), hidden[mode](), mode) for mode in range(MODES))
+        if ambiguity(variants).accepted:
+            return variants
+    raise RuntimeError(
+        f"the family {category} gave no acceptable object in {_ATTEMPTS} attempts (seed {seed})"
+    )
+
+
+def ambiguity(variants: Sequence[list[Solid]]) -> Ambiguity:
+    """Measure the rules of ambiguity on the variants of one object."""
+    radius = max(
+        float(np.linalg.norm(solid.vertices, axis=1).max()) for solids in variants for solid in solids
+    )
+    if radius > MAX_RADIUS:
+        return Ambiguity(np.nan, np.nan, np.nan, radius)
+    azimuth_deg = np.array([-FRONT_AZIMUTH_DEG, 0, FRONT_AZIMUTH_DEG, 180])
+    camera = orbit_camera(azimuth_deg, np.full(4, FRONT_ELEVATION_DEG), _JUDGED_SIZE)
+    views = [Renderer(surface_of(solids)).render(camera) for solids in variants]
+    clouds = [
+        [sample_union(solids, store.POINTS, np.random.default_rng(k)) for k in range(2)]
+        for solids in variants
+    ]
+    noise = [_chamfer(*pair) for pair in clouds]
+    pairs = list(itertools.combinations(range(len(variants)), 2))
+    changed = np.array([_changed_share(views[i], views[j]) for i, j in pairs])
+    return Ambiguity(
+        front=float(changed[:, :3].max()),
+        back=float(changed[:, 3].min()),
+        separation=min(_chamfer(clouds[i][0], clouds[j][0]) / max(noise[i], noise[j]) for i, j in pairs),
+        radius=radius,
+    )
+
+
+def generate(
+    out: Path,
+    *,
+    shapes: int,
+    categories: Sequence[str] | None,
+    seed: int,
+    size: int = 224,
+    views: int = 8,
+    processes: int | None = None,
+    variants: int = 1,
+) -> ProceduralReport:
+    """Make a dataset of procedural objects; running it again finishes or extends it.
+
+    Args:
+        out: folder of the dataset.
+        shapes: how many objects, shared evenly among the categories.
+        categories: families to draw from; None for all.
+        seed: of everything; object i is the same whatever `shapes` is.
+        size: pixels of a side of each view.
+        views: per object.
+        processes: None for one per core.
+        variants: hidden variants written for each object, 1 to 3, with the same cameras and in the same split.
+
+    Raises:
+        UserError: an unknown category, a number out of range, or a folder that holds something else.
+    """
+    names = tuple(FAMILIES) if categories is None else tuple(dict.fromkeys(categories))
+    unknown = [name for name in names if name not in FAMILIES]
+    if unknown or not names:
+        raise UserError(
+            f"no procedural family {', '.join(unknown) or '(none given)'}; there are: {', '.join(FAMILIES)}"
+        )
+    for name, value, low, high in (
+        ("shapes", shapes, 1, 10**6),
+        ("size", size, 16, 2048),
+        ("views", views, 1, 256),
+        ("variants", variants, 1, MODES),
+    ):
+        if not low <= value <= high:
+            raise UserError(f"{name} must be between {low} and {high}; got {value}")
+    if seed < 0:
+        raise UserError(f"seed must not be negative; got {seed}")
+    settings = {
+        "kind": "procedural",
+        "seed": seed,
+        "size": size,
+        "views": views,
+        "variants": variants,
+        "categories": list(names),
+    }
+    store.claim(out, settings)
+    jobs = [_Job(out, names[i % len(names)], i, seed, size, views, variants) for i in range(shapes)]
+    made, failures = 0, {}
+    for job, result in run_all(_make, jobs, processes=processes, desc="procedural shapes", unit="shape"):
+        if isinstance(result, Exception):
+            failures[f"{job.category} {job.index}"] = f"{job.category} {job.index}: {result}"
+        else:
+            made += result
+    counts = store.write_lists(out, seed=seed)
+    totals = {split: sum(by_synset.values()) for split, by_synset in counts.items()}
+    return ProceduralReport(out, made, sum(totals.values()) - made, names, totals, failures)
+
+
+def _make(job: _Job) -> int | Exception:
+    """Write the object's variants that are not there yet; how many were written."""
+    entropy = [job.seed, job.index]
+    modes = np.random.default_rng([*entropy, 1]).permutation(MODES)[: job.variants]
+    missing = [int(mode) for mode in modes if not store.is_written(job.out, job.shape(int(mode)))]
+    if not missing:
+        return 0
+    try:
+        solids_of_mode = variants_of(job.category, entropy)
+        camera = draw_camera(np.random.default_rng([*entropy, 2]), job.views, job.size)
+        for mode in missing:
+            solids = solids_of_mode[mode]
+            points = sample_union(solids, store.POINTS, np.random.default_rng([*entropy, 3, mode]))
+            store.write_shape(job.out, job.shape(mode), Renderer(surface_of(solids)).render(camera), points)
+    except (RuntimeError, OSError) as error:
+        return error
+    return len(missing)
+
+
+def _changed_share(a: Views, b: Views) -> np.ndarray:
+    """(V,) share of the pixels that either object covers where depth or colour differ."""
+    seen = np.isfinite(a.depth) | np.isfinite(b.depth)
+    with np.errstate(invalid="ignore"):  # inf - inf where both are empty, which `seen` leaves out
+        depth_differs = ~(np.abs(a.depth - b.depth) <= _SAME_DEPTH)
+    colour_differs = (np.abs(a.images.astype(int) - b.images) > _SAME_COLOUR).any(-1)
+    return ((depth_differs | colour_differs) & seen).sum((1, 2)) / seen.sum((1, 2))
+
+
+def _chamfer(a: np.ndarray, b: np.ndarray) -> float:
+    return float(KDTree(b).query(a)[0].mean() + KDTree(a).query(b)[0].mean())

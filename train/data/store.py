@@ -1,0 +1,192 @@
+"""The dataset on disk: the tree of the paper's release, written one whole shape at a time.
+
+    rendered-shapenet/<synset>/<model>/{render_i.png, depth_i.png, camera_i.json}
+    pcdata_2048/<synset>/<model>.ply
+    data_list/{train,val,test}/<synset>.list        lines "<synset>/<model>"
+
+Depth is uint16 with z = value / 65535 * 10, and 65535 where nothing is seen.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import trimesh
+
+from train.data.render import Views
+from train.errors import UserError
+
+RENDERS, CLOUDS, LISTS = "rendered-shapenet", "pcdata_2048", "data_list"
+SPLITS = ("train", "val", "test")
+POINTS = 2048
+_SHARES = {"test": 0.2, "val": 0.1}
+_EMPTY, _MAX_DEPTH = 65535, 10.0
+_SETTINGS = "made_with.json"
+
+
+def encode_depth(depth: np.ndarray) -> np.ndarray:
+    """Metric depth, +inf where empty, to the code on disk."""
+    code = np.full(depth.shape, _EMPTY, np.uint16)
+    seen = np.isfinite(depth)
+    code[seen] = np.clip(np.rint(depth[seen] * (_EMPTY / _MAX_DEPTH)), 0, _EMPTY - 1)
+    return code
+
+
+def decode_depth(code: np.ndarray) -> np.ndarray:
+    """The code on disk to metric depth float32, +inf where empty."""
+    return np.where(code == _EMPTY, np.inf, code * (_MAX_DEPTH / _EMPTY)).astype(np.float32)
+
+
+def render_folder(root: Path, shape: str) -> Path:
+    """Where the views of the shape "<synset>/<model>" live."""
+    return root / RENDERS / shape
+
+
+def cloud_file(root: Path, shape: str) -> Path:
+    """Where the ground-truth cloud of the shape "<synset>/<model>" lives."""
+    return root / CLOUDS / f"{shape}.ply"
+
+
+def is_written(root: Path, shape: str) -> bool:
+    """True if an earlier run finished this shape."""
+    return render_folder(root, shape).is_dir() and cloud_file(root, shape).is_file()
+
+
+def write_shape(root: Path, shape: str, views: Views, points: np.ndarray) -> None:
+    """Write one shape so that its folder appears complete or not at all, whenever the process dies.
+
+    The cloud goes first and the folder of views is renamed into place last: the folder there means "finished".
+    """
+    target, cloud = render_folder(root, shape), cloud_file(root, shape)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    cloud.parent.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=".writing-", dir=target.parent))
+    try:
+        scratch.chmod(0o755)
+        K, cam_from_world = views.camera.K.tolist(), views.camera.cam_from_world.tolist()
+        for i, (image, depth) in enumerate(zip(views.images, views.depth, strict=True)):
+            imageio.imwrite(scratch / f"render_{i}.png", image, compress_level=3)
+            imageio.imwrite(scratch / f"depth_{i}.png", encode_depth(depth), compress_level=3)
+            record = {
+                "K": K[i],
+                "cam_from_world": cam_from_world[i],
+                "height": views.camera.height,
+                "width": views.camera.width,
+            }
+            (scratch / f"camera_{i}.json").write_text(json.dumps(record))
+        write_bytes_atomically(cloud, _ply_bytes(points))
+        if target.exists():
+            shutil.rmtree(target)
+        os.replace(scratch, target)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _ply_bytes(points: np.ndarray) -> bytes:
+    content = trimesh.PointCloud(points.astype(np.float32)).export(file_type="ply")
+    return content if isinstance(content, bytes) else str(content).encode()
+
+
+def write_bytes_atomically(path: Path, content: bytes) -> None:
+    """Replace a file in one step."""
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    scratch.write_bytes(content)
+    os.replace(scratch, path)
+
+
+def write_lists(root: Path, *, seed: int) -> dict[str, dict[str, int]]:
+    """Split what is on disk into train, val and test (about 70/10/20) and write the lists.
+
+    The split depends on the seed and the shape's own name, so that it stays when shapes are added. Hidden
+    variants of one object, named `<object>_h<k>`, stay together. From five objects on, each category has at least
+    one object in val and in test.
+
+    Returns:
+        Counts, by split and synset.
+    """
+    shapes_by_synset: dict[str, list[str]] = defaultdict(list)
+    for folder in sorted((root / RENDERS).glob("*/*")):
+        shape = f"{folder.parent.name}/{folder.name}"
+        if not folder.name.startswith(".") and is_written(root, shape):
+            shapes_by_synset[folder.parent.name].append(shape)
+    counts: dict[str, dict[str, int]] = {split: {} for split in SPLITS}
+    for synset, shapes in shapes_by_synset.items():
+        split_of = split_shapes(shapes, seed=seed)
+        for split in SPLITS:
+            lines = [shape for shape in shapes if split_of[shape] == split]
+            counts[split][synset] = len(lines)
+            path = root / LISTS / split / f"{synset}.list"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes_atomically(path, "".join(f"{line}\n" for line in lines).encode())
+    return counts
+
+
+def split_shapes(shapes: Iterable[str], *, seed: int) -> dict[str, str]:
+    """The split of each shape of one category; see `write_lists`."""
+    objects: dict[str, list[str]] = defaultdict(list)
+    for shape in shapes:
+        objects[re.sub(r"_h\d+$", "", shape)].append(shape)
+    fraction = {name: _hash_fraction(f"{seed}:{name}") for name in objects}
+    order = sorted(objects, key=lambda name: fraction[name])
+    split_of = {name: _split_at(fraction[name]) for name in objects}
+    for missing in (split for split in SPLITS if len(order) >= 5 and split not in split_of.values()):
+        largest, _ = Counter(split_of.values()).most_common(1)[0]
+        split_of[next(name for name in order if split_of[name] == largest)] = missing
+    return {shape: split_of[name] for name in order for shape in objects[name]}
+
+
+def _hash_fraction(text: str) -> float:
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") / 2**64
+
+
+def _split_at(fraction: float) -> str:
+    if fraction < _SHARES["test"]:
+        return "test"
+    return "val" if fraction < _SHARES["test"] + _SHARES["val"] else "train"
+
+
+def claim(out: Path, settings: dict) -> None:
+    """Prepare the folder for a conversion, new or restarted; refuse to mix data made with other settings.
+
+    Raises:
+        UserError: `out` is a file, holds something else, or holds data made with other settings.
+    """
+    marker = out / _SETTINGS
+    if marker.is_file():
+        earlier = json.loads(marker.read_text())
+        changed = [
+            f"{key} {earlier.get(key)!r} there, {value!r} now"
+            for key, value in settings.items()
+            if earlier.get(key) != value
+        ]
+        if changed:
+            raise UserError(
+                f"{out} holds data made with other settings ({'; '.join(changed)}); "
+                "choose another --out, or delete the folder"
+            )
+        _remove_leftovers(out)
+        return
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(
+            f"{out} exists and is no dataset of this program; choose a new or empty folder for --out"
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    write_bytes_atomically(marker, json.dumps(settings, indent=1).encode())
+
+
+def _remove_leftovers(root: Path) -> None:
+    """Half-written shapes of a run that was killed."""
+    for scratch in (root / RENDERS).glob("*/.writing-*"):
+        shutil.rmtree(scratch, ignore_errors=True)
+    for scratch in (root / CLOUDS).glob("*/.*"):
+        scratch.unlink(missing_ok=True)
