@@ -94,7 +94,9 @@ def save_checkpoint(run: Path, step: int, model: Generator, state: dict[str, Any
         model: the generator.
         state: everything else, as tensors, numbers, strings, lists and dicts.
     """
-    with replacing(run / "checkpoints" / f"step-{step:08d}") as directory:
+    target = run / "checkpoints" / f"step-{step:08d}"
+    remove(target)
+    with replacing(target) as directory:
         directory.mkdir()
         save_weights(model, directory / "weights.safetensors")
         torch.save(state, directory / "state.pt")

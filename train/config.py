@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import typing
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -63,6 +64,13 @@ class StageConfig:
         """Alpha for the exact mean earth mover's distance."""
         return self.alpha * EXACT_MEAN_EMD_FROM_PAPER
 
+    def learning_rate_at(self, step: int) -> float:
+        """Linear warm-up, times a cosine from the first learning rate to the final one."""
+        warm = min(1.0, (step + 1) / (self.warmup + 1))
+        share_left = 0.5 + 0.5 * math.cos(math.pi * min(1.0, step / max(1, self.steps)))
+        first, final = self.learning_rate, self.final_learning_rate
+        return warm * (final + (first - final) * share_left)
+
     def diversity_weight(self, step: int) -> float:
         """Beta at a step of this stage, ramp included."""
         start, end = self.ramp
@@ -92,6 +100,8 @@ class FitConfig:
     profile: Profile = "cpu"
     """Size of the network: full 192 x 256 images and 2048 points, cpu 96 x 128 and 512, smoke 48 x 64 and
     128."""
+    categories: tuple[str, ...] = ()
+    """Categories to train on; none means all."""
     deterministic: bool = False
     """Train the counterpart without random codes (one code per image, no diversity loss)."""
     map_size: int = 28
@@ -184,20 +194,22 @@ def scaled(config: FitConfig, share: float) -> FitConfig:
     )
 
 
-def to_json(config: Any) -> str:
-    """A configuration as indented JSON."""
-    return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
+def to_json(config: FitConfig, *, data: str) -> str:
+    """A run's config.json: the data it was trained on, and every field of its configuration."""
+    return json.dumps({"data": data, **dataclasses.asdict(config)}, indent=2) + "\n"
 
 
 def fit_config_from_json(text: str, *, where: str) -> FitConfig:
-    """Reads what `to_json` wrote.
+    """Reads a run's config.json: the fields of FitConfig, and beside them "data".
 
     Args:
         text: the JSON.
         where: name of the file, for the error.
     """
     try:
-        return _build(FitConfig, json.loads(text))
+        values = json.loads(text)
+        values.pop("data", None)
+        return _build(FitConfig, values)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise UserError(
             f"{where} is not the configuration of a run ({error}); was it written by `fit`?"

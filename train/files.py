@@ -14,15 +14,13 @@ from pathlib import Path
 def replacing(target: Path) -> Iterator[Path]:
     """Yields a temporary path beside `target`; what is written there becomes `target` on success.
 
-    The path may be made a file or a directory. An existing target file is replaced in one step; an existing
-    target directory is removed first, because a rename cannot replace one that is not empty.
+    The path may be made a file, which replaces an old one in one step, or a directory, whose target must be
+    new.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         yield temporary
-        if target.is_dir():
-            shutil.rmtree(target)
         os.replace(temporary, target)
     finally:
         remove(temporary)

@@ -1,0 +1,242 @@
+"""A split of the data in memory, ready for the network, and the sampler that draws batches from it.
+
+Images are kept as bytes at the network's input size; depth maps at the size at which the front constraint
+compares, with cameras that fit the smaller maps exactly, so that prediction and observation are made with one
+camera.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+from tqdm import tqdm
+
+from diffpoint import PinholeCamera
+
+from .data import Shape, ShapeTree
+from .errors import UserError
+
+
+class SmallDepth(NamedTuple):
+    """Depth maps at the comparison's size, with the cameras that belong to them."""
+
+    depth: Tensor
+    camera: PinholeCamera
+
+
+def decimate_depth(depth: Tensor, camera: PinholeCamera, *, size: int) -> SmallDepth:
+    """Keeps one pixel of every f x f block: the one at index f*i + f//2, at its own exact place.
+
+    Its centre, f*i + f//2 + 0.5, is the centre i + 0.5 of small pixel i of a camera whose principal point is
+    shifted by half a large pixel (f even; none for f odd) before both are divided by f. Nothing is rounded.
+
+    Args:
+        depth: (V, H, H) metric depth, +inf where empty.
+        camera: batch shape (V,), of H x H pixels.
+        size: side of the small maps; divides H.
+    """
+    factor = _factor(depth, size)
+    start = factor // 2
+    shift = start + 0.5 - factor / 2
+    return SmallDepth(depth[:, start::factor, start::factor], _shrink(camera, factor, shift, size))
+
+
+def min_pool_depth(depth: Tensor, camera: PinholeCamera, *, size: int) -> SmallDepth:
+    """Keeps the nearest depth of every f x f block, at the block's centre: what the paper does.
+
+    Args and result as in `decimate_depth`. The nearest surface of a block is seldom at its centre, so the
+    observed points are off by up to half a small pixel.
+    """
+    factor = _factor(depth, size)
+    nearest = -F.max_pool2d(-depth[:, None], factor)[:, 0]
+    return SmallDepth(nearest, _shrink(camera, factor, 0.0, size))
+
+
+def _factor(depth: Tensor, size: int) -> int:
+    side = depth.shape[-1]
+    if depth.shape[-2] != side or side % size:
+        got = tuple(depth.shape[-2:])
+        raise ValueError(f"depth maps must be square with a side divisible by {size}; got {got}")
+    return side // size
+
+
+def _shrink(camera: PinholeCamera, factor: int, shift: float, size: int) -> PinholeCamera:
+    K = camera.K.clone()
+    K[..., :2, 2] -= shift
+    K[..., :2, :] /= factor
+    return PinholeCamera(K, camera.cam_from_world, size, size)
+
+
+_POOLS = {"decimate": decimate_depth, "min": min_pool_depth}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LoadedSplit:
+    """M shapes with V views each.
+
+    Attributes:
+        images: (M, V, 3, h, w) uint8 at the network's input size.
+        depth: (M, V, S, S) float32 metric depth, +inf where empty.
+        K: (M, V, 3, 3) intrinsics for maps of S x S pixels.
+        cam_from_world: (M, V, 4, 4).
+        points: (M, P, 3) ground truth in the world frame.
+        ids: "synset/model" of every shape.
+        categories: category name of every shape.
+    """
+
+    images: Tensor
+    depth: Tensor
+    K: Tensor
+    cam_from_world: Tensor
+    points: Tensor
+    ids: list[str]
+    categories: list[str]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def views(self) -> int:
+        """Views per shape."""
+        return self.images.shape[1]
+
+    @property
+    def fingerprint(self) -> str:
+        """Changes when shapes, views or ground truth change."""
+        digest = hashlib.sha256("\n".join(self.ids).encode())
+        digest.update(np.ascontiguousarray(self.points[:, :8].numpy()).tobytes())
+        digest.update(str(tuple(self.images.shape)).encode())
+        return digest.hexdigest()[:16]
+
+    def float_images(self, shapes: Tensor, views: Tensor) -> Tensor:
+        """(B,) shape and (B, V) view numbers -> (B, V, 3, h, w) images in [0, 1]."""
+        return self.images[shapes[:, None], views].float() / 255
+
+    def batch(self, shapes: Tensor, views: Tensor) -> Batch:
+        """(B,) shape and (B, V) view numbers -> what one training step needs."""
+        picked = (shapes[:, None], views)
+        size = self.depth.shape[-1]
+        camera = PinholeCamera(self.K[picked], self.cam_from_world[picked], size, size)
+        return Batch(self.float_images(shapes, views), self.depth[picked], camera)
+
+
+class Batch(NamedTuple):
+    """B shapes with V views each: images (B, V, 3, h, w), depth (B, V, S, S), camera (B, V)."""
+
+    images: Tensor
+    depth: Tensor
+    camera: PinholeCamera
+
+
+def load_split(
+    data: Path,
+    split: Literal["train", "val", "test"],
+    *,
+    image_size: tuple[int, int],
+    map_size: int,
+    gt_pool: Literal["decimate", "min"] = "decimate",
+    categories: Sequence[str] = (),
+    limit: int | None = None,
+    progress: bool = True,
+) -> LoadedSplit:
+    """Reads a split of a data tree into memory; broken shapes are named and left out.
+
+    Args:
+        data: root of the tree.
+        split: which list to read.
+        image_size: height and width of the network's input.
+        map_size: side of the depth maps for the front constraint.
+        gt_pool: how the depth maps shrink.
+        categories: names to keep; none means all.
+        limit: read at most that many shapes, spread evenly over the list.
+        progress: show a bar.
+
+    Raises:
+        UserError: no such tree, no usable shape, or renders whose side is not a multiple of `map_size`.
+    """
+    tree = ShapeTree(data, split, list(categories) or None)
+    if limit is not None and len(tree) > limit:
+        tree.ids = [tree.ids[index * len(tree.ids) // limit] for index in range(limit)]
+    rows: list[_Row] = []
+    bar = tqdm(
+        tree.iter_valid(), f"reading {split}", len(tree), leave=False, unit="shape", disable=not progress
+    )
+    for shape in bar:
+        if reason := _unusable(shape, rows[0].shape if rows else shape):
+            tree.skipped[shape.id] = reason
+            continue
+        if shape.depth.shape[-1] % map_size:
+            raise UserError(
+                f"{data}: renders are {shape.depth.shape[-1]} pixels wide, not a multiple of the map size "
+                f"{map_size}; render at another size or set --map-size"
+            )
+        small = _POOLS[gt_pool](shape.depth, shape.camera, size=map_size)
+        rows.append(_Row(_bytes_at(shape.images, image_size), small.depth, small.camera, shape))
+    for reason in tree.skipped.values():
+        tqdm.write(f"left out: {reason}", file=sys.stderr)
+    if not rows:
+        raise UserError(
+            f"{data} has no usable shape in its {split} split; try `python -m train data check {data}`"
+        )
+    return LoadedSplit(
+        images=torch.stack([row.images for row in rows]),
+        depth=torch.stack([row.depth for row in rows]),
+        K=torch.stack([row.camera.K for row in rows]),
+        cam_from_world=torch.stack([row.camera.cam_from_world for row in rows]),
+        points=torch.stack([row.shape.points for row in rows]),
+        ids=[row.shape.id for row in rows],
+        categories=[row.shape.category for row in rows],
+    )
+
+
+class _Row(NamedTuple):
+    images: Tensor
+    depth: Tensor
+    camera: PinholeCamera
+    shape: Shape
+
+
+def _bytes_at(images: Tensor, size: tuple[int, int]) -> Tensor:
+    resized = F.interpolate(images, size=size, mode="bilinear", align_corners=False, antialias=True)
+    return (resized.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _unusable(shape: Shape, first: Shape) -> str | None:
+    """Why a shape cannot be stacked with the first one and trained on, or None."""
+    for name, count in (("depth", "views and pixels"), ("points", "points")):
+        want, got = tuple(getattr(first, name).shape), tuple(getattr(shape, name).shape)
+        if want != got:
+            return f"{shape.id}: {count} {got} differ from {want} of {first.id}"
+    empty = ~shape.depth.isfinite().flatten(1).any(1)
+    return f"{shape.id}: view {int(empty.int().argmax())} shows nothing" if empty.any() else None
+
+
+class Sampler:
+    """Draws shapes (without repetition inside a batch) and views; its state can be kept and put back."""
+
+    def __init__(self, shapes: int, views: int, *, seed: int) -> None:
+        self._shapes, self._views = shapes, views
+        self._random = np.random.default_rng(seed)
+
+    def draw(self, shapes: int, views: int) -> tuple[Tensor, Tensor]:
+        """(B,) shape numbers and (B, V) view numbers; a split smaller than the batch repeats its shapes."""
+        picked = self._random.choice(self._shapes, size=shapes, replace=shapes > self._shapes)
+        angles = np.stack([self._random.permutation(self._views)[:views] for _ in range(shapes)])
+        return torch.from_numpy(picked), torch.from_numpy(angles)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that decides the next draws."""
+        return dict(self._random.bit_generator.state)
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues where `state` was taken."""
+        self._random.bit_generator.state = state

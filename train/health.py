@@ -1,0 +1,55 @@
+"""Whether a network in training still listens: to the image, to the code, and with how much of its trunk.
+
+The loss does not tell: a generator whose image trunk has died fits the data's mean shape, and its loss still
+falls.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffpoint import chamfer_distance
+from models import Generator
+
+
+class Sensitivity(NamedTuple):
+    """Mean chamfer distance x100 (both directions) between pairs of predictions.
+
+    Attributes:
+        image: of different images at one code.
+        code: of different codes at one image.
+        dead_share: share of the trunk's output channels that are zero on every image and at every place.
+    """
+
+    image: float
+    code: float
+    dead_share: float
+
+
+@torch.no_grad()
+def sensitivity(model: Generator, images: Tensor, *, seed: int = 0) -> Sensitivity:
+    """Measures how far predictions move with the image and with the code.
+
+    Args:
+        model: a generator.
+        images: (B, 3, H, W) of B >= 2 different shapes, in [0, 1].
+        seed: draws the two codes that are used.
+    """
+    if len(images) < 2:
+        raise ValueError(f"sensitivity: needs at least 2 images, got {len(images)}")
+    codes = torch.randn(2, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
+    features = model.encode(images)
+    clouds = model.decode(features, codes.expand(2, len(images), -1))
+    return Sensitivity(
+        image=_mean_cd100(clouds[0], clouds[0].roll(1, 0)),
+        code=_mean_cd100(clouds[0], clouds[1]),
+        dead_share=(features.amax((0, 2, 3)) <= 0).float().mean().item(),
+    )
+
+
+def _mean_cd100(a: Tensor, b: Tensor) -> float:
+    distance = chamfer_distance(a.contiguous(), b.contiguous(), squared=False)
+    return 100 * (distance.a_to_b + distance.b_to_a).mean().item()

@@ -1,0 +1,53 @@
+"""The record of a run: metrics.jsonl for programs, TensorBoard events for people, a bar for whoever waits."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from torch.utils.tensorboard import SummaryWriter
+
+from .files import write_text
+
+
+class RunLog:
+    """Appends one JSON object per record to RUN/metrics.jsonl and the same numbers to TensorBoard events.
+
+    Args:
+        run: the run's directory.
+        step: steps already done; later records, from before a kill, are dropped.
+    """
+
+    def __init__(self, run: Path, *, step: int) -> None:
+        self._path = run / "metrics.jsonl"
+        write_text(self._path, "".join(line for line in _lines(self._path) if _step_of(line) <= step))
+        self._events = SummaryWriter(str(run / "events"), purge_step=step + 1)
+
+    def write(self, step: int, values: dict[str, Any]) -> None:
+        """Records values at a step (counted over all stages)."""
+        with self._path.open("a") as file:
+            file.write(json.dumps({"step": step, **values}) + "\n")
+        for name, value in values.items():
+            if isinstance(value, (int, float)):
+                self._events.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Flushes the events."""
+        self._events.close()
+
+
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """All records of a run, in order."""
+    return [json.loads(line) for line in _lines(run / "metrics.jsonl")]
+
+
+def _lines(path: Path) -> list[str]:
+    """Complete lines; one cut short by a kill is left out."""
+    if not path.exists():
+        return []
+    return [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+
+
+def _step_of(line: str) -> int:
+    return int(json.loads(line)["step"])
