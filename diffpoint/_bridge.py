@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,7 +34,7 @@ def register(
     without a formula refuses to be differentiated, by its name.
     """
 
-    def decorate(function: Callable) -> Callable:
+    def decorate(function: Callable) -> Callable[..., Any]:
         op = torch.library.custom_op(f"diffpoint::{name}", function, mutates_args=())
         op.register_fake(fake)
         if backward is not None:

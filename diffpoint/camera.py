@@ -98,33 +98,33 @@ class PinholeCamera:
 
         Example:
             >>> PinholeCamera.look_at((2.0, 0, 0), focal_px=100.0, height=8, width=8).cam_from_world[2].tolist()
-            [-1.0, -0.0, -0.0, 2.0]
+            [-1.0, 0.0, 0.0, 2.0]
         """
-        eye = _vector("eye", eye)
-        target = _vector("target", target, eye)
-        up = _vector("up", up, eye)
-        eye, target, up = torch.broadcast_tensors(eye, target, up)
-        forward = target - eye
-        right = torch.linalg.cross(forward, up)
+        at = _vector("eye", eye)
+        at, towards, upward = torch.broadcast_tensors(
+            at, _vector("target", target, at), _vector("up", up, at)
+        )
+        forward = towards - at
+        right = torch.linalg.cross(forward, upward)
         if bool((forward.norm(dim=-1) == 0).any()) or bool((right.norm(dim=-1) < 1e-9).any()):
             raise _checks.fail(
                 "PinholeCamera.look_at",
                 "up",
                 "differ in direction from target - eye, and eye from target",
-                f"eye {eye.reshape(-1, 3)[0].tolist()}, target {target.reshape(-1, 3)[0].tolist()}",
+                f"eye {at.reshape(-1, 3)[0].tolist()}, target {towards.reshape(-1, 3)[0].tolist()}",
                 "Choose another 'up', for instance (0, 0, 1) for a view from above.",
             )
         forward = forward / forward.norm(dim=-1, keepdim=True)
         right = right / right.norm(dim=-1, keepdim=True)
         down = torch.linalg.cross(forward, right)
         rotation = torch.stack((right, down, forward), dim=-2)
-        cam_from_world = torch.zeros((*eye.shape[:-1], 4, 4), dtype=eye.dtype)
+        cam_from_world = torch.zeros((*at.shape[:-1], 4, 4), dtype=at.dtype)
         cam_from_world[..., :3, :3] = rotation
-        cam_from_world[..., :3, 3] = -(rotation @ eye[..., None])[..., 0]
+        cam_from_world[..., :3, 3] = -(rotation @ at[..., None])[..., 0]
         cam_from_world[..., 3, 3] = 1
         K = torch.tensor(
-            [[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]], dtype=eye.dtype
-        ).expand(*eye.shape[:-1], 3, 3)
+            [[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]], dtype=at.dtype
+        ).expand(*at.shape[:-1], 3, 3)
         return cls(K, cam_from_world, height, width)
 
     @classmethod
@@ -145,7 +145,8 @@ class PinholeCamera:
         `K` is the OpenCV matrix in pixels (`cameras_from_opencv_projection` is the way back).
 
         Example:
-            >>> PinholeCamera.from_pytorch3d(torch.eye(3), torch.tensor([0.0, 0, 2]), torch.eye(3), 4, 4).position.tolist()
+            >>> R, T, K = torch.eye(3), torch.tensor([0.0, 0.0, 2.0]), torch.eye(3)
+            >>> PinholeCamera.from_pytorch3d(R, T, K, 4, 4).position.tolist()
             [0.0, 0.0, -2.0]
         """
         view_from_world = torch.zeros((*R.shape[:-2], 4, 4), dtype=R.dtype)
@@ -166,7 +167,7 @@ class PinholeCamera:
     @property
     def position(self) -> Tensor:
         """Optical centres in the world, (..., 3)."""
-        return torch.linalg.inv(self.cam_from_world)[..., :3, 3]
+        return torch.linalg.inv(self.cam_from_world)[..., :3, 3] + 0.0  # no -0.0
 
     @property
     def projection(self) -> Tensor:

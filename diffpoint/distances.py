@@ -49,7 +49,7 @@ def nearest(
         >>> nearest(a, b).squared_distance.tolist()
         [0.25, 2.25]
     """
-    a3, b3, la, lb, batch = paired_sets("nearest", a, b, a_lengths, b_lengths)
+    a3, b3, la, lb, _ = paired_sets("nearest", a, b, a_lengths, b_lengths)
     squared_distance, index = _nearest(a3, b3, la, lb, "nearest", 0)
     return Nearest(squared_distance.reshape(a.shape[:-1]), index.reshape(a.shape[:-1]))
 

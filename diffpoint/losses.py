@@ -108,7 +108,9 @@ def front_constraint(
     Example:
         >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=8.0, height=8, width=8)
         >>> cloud = torch.rand(1, 50, 3) - 0.5
-        >>> front_constraint(cloud, camera, splat_depth(cloud, camera).depth).item() < 0.1
+        >>> depth = splat_depth(cloud, camera).depth
+        >>> same, shifted = (front_constraint(c, camera, depth).item() for c in (cloud, cloud + 0.2))
+        >>> same < shifted  # not 0: the points of a pixel are compared with its centre
         True
     """
     _checks.check_choice("front_constraint", "distance", distance, ("chamfer", "emd"))

@@ -51,7 +51,7 @@ def sample_view(points: Tensor, splat: Splat) -> ViewSample:
         raise TypeError(
             f"sample_view: 'splat' must be the result of splat_depth; got {type(splat).__name__}."
         )
-    batch, views, count = splat.visible.shape
+    batch, _, count = splat.visible.shape
     if (batch, count) != tuple(points.shape[:2]):
         raise _checks.fail(
             "sample_view",
@@ -66,11 +66,10 @@ def sample_view(points: Tensor, splat: Splat) -> ViewSample:
 def _sample_fake(points: Tensor, visible: Tensor):
     largest = torch.library.get_ctx().new_dynamic_size()
     shape = (*visible.shape[:2], largest)
-    integers = {"dtype": torch.int64}
     return (
         points.new_empty((*shape, 3)),
-        points.new_empty(shape, **integers),
-        points.new_empty(shape[:2], **integers),
+        points.new_empty(shape, dtype=torch.int64),
+        points.new_empty(shape[:2], dtype=torch.int64),
     )
 
 

@@ -1,0 +1,292 @@
+"""Every op once more in plain torch: slow, obvious, and the judge of the tests.
+
+Cameras are passed as `K` (B, V, 3, 3) and `cam_from_world` (B, V, 4, 4), because this file imports torch and nothing
+else. Shapes, units, frames and conventions are those of the public functions of the same names. Gradients come from
+torch's autograd; sums over pairs are written as full matrices, so memory is O(N M).
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor
+
+# Full matrices go through this, not through cdist: cdist takes another formula for large sets and loses digits.
+
+
+def pairwise_squared_distance(a: Tensor, b: Tensor) -> Tensor:
+    """(*B, N, 3), (*B, M, 3) -> (*B, N, M)."""
+    return (a[..., :, None, :] - b[..., None, :, :]).square().sum(-1)
+
+
+def project(points: Tensor, K: Tensor, cam_from_world: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (B, V, N, 2) and depth (B, V, N); pixels of points at or behind the camera's plane are +inf."""
+    in_camera = points[:, None] @ cam_from_world[..., :3, :3].mT + cam_from_world[..., None, :3, 3]
+    depth = in_camera[..., 2]
+    front = depth > 0
+    homogeneous = in_camera @ K.mT
+    pixels = homogeneous[..., :2] / torch.where(front, depth, 1.0)[..., None]
+    return torch.where(front[..., None], pixels, torch.inf), depth
+
+
+def unproject_dense(depth: Tensor, K: Tensor, cam_from_world: Tensor) -> Tensor:
+    """World points (B, V, H, W, 3) at the pixel centres; zeros where the map is empty."""
+    height, width = depth.shape[-2:]
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    centres = torch.stack((columns + 0.5, rows + 0.5, torch.ones_like(rows)), dim=-1).to(depth.dtype)
+    foreground = torch.isfinite(depth)
+    rays = centres @ torch.linalg.inv(K)[..., None, :, :].mT
+    in_camera = rays * torch.where(foreground, depth, 0.0)[..., None]
+    world_from_cam = torch.linalg.inv(cam_from_world)[..., None, :, :]
+    world = in_camera @ world_from_cam[..., :3, :3].mT + world_from_cam[..., None, :3, 3]
+    return torch.where(foreground[..., None], world, 0.0)
+
+
+def unproject(depth: Tensor, K: Tensor, cam_from_world: Tensor) -> tuple[Tensor, Tensor]:
+    """Foreground points first (B, V, H*W, 3), and how many they are (B, V)."""
+    batch, views, height, width = depth.shape
+    dense = unproject_dense(depth, K, cam_from_world).flatten(2, 3)
+    foreground = torch.isfinite(depth).flatten(2)
+    points = dense.new_zeros(batch, views, height * width, 3)
+    rows = []
+    for b, v in itertools.product(range(batch), range(views)):
+        kept = dense[b, v, foreground[b, v]]
+        rows.append(torch.cat((kept, points[b, v, len(kept) :])))
+    lengths = foreground.sum(-1)
+    return (torch.stack(rows).view(points.shape) if rows else points), lengths
+
+
+def reproject(
+    depth: Tensor, source: tuple[Tensor, Tensor], target: tuple[Tensor, Tensor], size: tuple[int, int]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points, pixels, depth and validity in the target, whose map has `size` (height, width)."""
+    batch, views, height, width = depth.shape
+    points = unproject_dense(depth, *source)
+    flat = points.reshape(batch * views, height * width, 3)
+    K, cam_from_world = (m.expand(batch, views, *m.shape[-2:]).reshape(-1, 1, *m.shape[-2:]) for m in target)
+    pixels, seen = project(flat, K, cam_from_world)
+    pixels, seen = pixels.view(batch, views, height, width, 2), seen.view(depth.shape)
+    foreground = torch.isfinite(depth)
+    u, v = pixels.unbind(-1)
+    inside = (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0]) & (seen > 0)
+    return (
+        points,
+        torch.where(foreground[..., None], pixels, torch.inf),
+        torch.where(foreground, seen, torch.inf),
+        foreground & inside,
+    )
+
+
+def splat_depth(
+    points: Tensor,
+    K: Tensor,
+    cam_from_world: Tensor,
+    height: int,
+    width: int,
+    *,
+    radius: float = 0.0,
+    lengths: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth (B, V, H, W), index (B, V, H, W) and visible (B, V, N): every point against every pixel."""
+    pixels, depth = project(points, K, cam_from_world)
+    u, v = pixels[..., 0, None, None], pixels[..., 1, None, None]
+    rows = torch.arange(height)[:, None]
+    columns = torch.arange(width)[None, :]
+    covers = (u.floor() == columns) & (v.floor() == rows)
+    if radius > 0:
+        covers = covers | ((columns + 0.5 - u).square() + (rows + 0.5 - v).square() <= radius * radius)
+    covers = covers & (depth > 0)[..., None, None]
+    if lengths is not None:
+        covers = covers & (torch.arange(points.shape[1]) < lengths[:, None])[:, None, :, None, None]
+    candidates = torch.where(covers, depth[..., None, None], torch.inf)
+    if points.shape[1] == 0:
+        maps = (*depth.shape[:2], height, width)
+        return points.new_full(maps, torch.inf), torch.full(maps, -1), depth > 0
+    nearest_depth, index = candidates.min(dim=2)
+    # torch.min may return any of equal entries; the convention is the lowest index.
+    index = (candidates == nearest_depth[:, :, None]).to(torch.uint8).argmax(dim=2)
+    empty = torch.isinf(nearest_depth)
+    gathered = torch.take_along_dim(depth, index.flatten(2), dim=2).view(index.shape)
+    index = torch.where(empty, -1, index)
+    visible = torch.zeros_like(depth, dtype=torch.bool)
+    for b, w in itertools.product(range(index.shape[0]), range(index.shape[1])):
+        visible[b, w, index[b, w][index[b, w] >= 0]] = True
+    return torch.where(empty, torch.inf, gathered), index, visible
+
+
+def sample_view(points: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Points (B, V, M, 3), index (B, V, M) and lengths (B, V) of the visible points."""
+    batch, views, _ = visible.shape
+    lengths = visible.sum(-1)
+    largest = int(lengths.max()) if lengths.numel() else 0
+    index = torch.full((batch, views, largest), -1)
+    for b, v in itertools.product(range(batch), range(views)):
+        chosen = visible[b, v].nonzero()[:, 0]
+        index[b, v, : len(chosen)] = chosen
+    gathered = torch.take_along_dim(points[:, None], index.clamp(min=0)[..., None], dim=2)
+    return torch.where((index >= 0)[..., None], gathered, 0.0), index, lengths
+
+
+def nearest(
+    a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Squared distance (*B, N) and index (*B, N)."""
+    if b.shape[-2] == 0:
+        d, index = a.new_full(a.shape[:-1], torch.inf), torch.full(a.shape[:-1], -1)
+    else:
+        matrix = pairwise_squared_distance(a, b)
+        if b_lengths is not None:
+            matrix = torch.where(_mask(b, b_lengths)[..., None, :], matrix, torch.inf)
+        least = matrix.detach().min(-1, keepdim=True).values
+        index = (matrix.detach() == least).to(torch.uint8).argmax(-1)
+        d = torch.take_along_dim(matrix, index[..., None], dim=-1)[..., 0]
+        index = torch.where(torch.isinf(d), -1, index)
+    if a_lengths is not None:
+        inside = _mask(a, a_lengths)
+        d, index = torch.where(inside, d, 0.0), torch.where(inside, index, -1)
+    return d, index
+
+
+def chamfer_distance(
+    a: Tensor, b: Tensor, *, squared: bool, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """a_to_b (*B) and b_to_a (*B)."""
+    directions = []
+    for first, second, first_lengths, second_lengths in (
+        (a, b, a_lengths, b_lengths),
+        (b, a, b_lengths, a_lengths),
+    ):
+        d, _ = nearest(first, second, a_lengths=first_lengths, b_lengths=second_lengths)
+        count = first.shape[-2] if first_lengths is None else first_lengths
+        directions.append((d if squared else _sqrt(d)).sum(-1) / count)
+    return directions[0], directions[1]
+
+
+def earth_mover_distance(
+    a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Exact cost (*B) and assignment (*B, N), by shortest augmenting paths."""
+    batch = a.shape[:-2]
+    a3, b3 = a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:])
+    la = torch.full((len(a3),), a.shape[-2]) if a_lengths is None else a_lengths.reshape(-1)
+    lb = torch.full((len(b3),), b.shape[-2]) if b_lengths is None else b_lengths.reshape(-1)
+    costs, assignments = [], []
+    for x, y, n, m in zip(a3, b3, la.tolist(), lb.tolist(), strict=True):
+        matrix = _sqrt(pairwise_squared_distance(x[:n], y[:m]))
+        columns = torch.full((len(x),), -1)
+        if n <= m:
+            columns[:n] = assign(matrix.detach())
+        else:
+            rows = assign(matrix.detach().T)
+            columns[rows] = torch.arange(m)
+        matched = (columns >= 0).nonzero()[:, 0]
+        costs.append(matrix[matched, columns[matched]].mean())
+        assignments.append(columns)
+    return torch.stack(costs).reshape(batch), torch.stack(assignments).reshape(a.shape[:-1])
+
+
+def assign(cost: Tensor) -> Tensor:
+    """The column of each row in the cheapest assignment of all rows (n <= m), cost (n, m); O(n^2 m)."""
+    n, m = cost.shape
+    row_price = cost.new_zeros(n + 1)
+    column_price = cost.new_zeros(m + 1)
+    row_of = torch.zeros(m + 1, dtype=torch.long)  # rows and columns count from 1; 0 is "none"
+    for row in range(1, n + 1):
+        row_of[0] = row
+        column = 0
+        shortest = cost.new_full((m + 1,), torch.inf)
+        previous = torch.zeros(m + 1, dtype=torch.long)
+        used = torch.zeros(m + 1, dtype=torch.bool)
+        while row_of[column] != 0:
+            used[column] = True
+            current = int(row_of[column])
+            reduced = cost[current - 1] - row_price[current] - column_price[1:]
+            better = ~used[1:] & (reduced < shortest[1:])
+            shortest[1:][better] = reduced[better]
+            previous[1:][better] = column
+            step, free = torch.where(used[1:], torch.inf, shortest[1:]).min(0)
+            row_price[row_of[used]] += step
+            column_price[used] -= step
+            shortest[~used] -= step
+            column = int(free) + 1
+        while column:
+            row_of[column] = row_of[previous[column]]
+            column = int(previous[column])
+    columns = torch.empty(n, dtype=torch.long)
+    taken = row_of[1:] > 0
+    columns[row_of[1:][taken] - 1] = taken.nonzero()[:, 0]
+    return columns
+
+
+def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Tensor | None = None) -> Tensor:
+    """Indices (*B, k)."""
+    distance = points.new_full(points.shape[:-1], torch.inf)
+    if lengths is not None:
+        distance = torch.where(_mask(points, lengths), distance, -1.0)
+    current = torch.full(points.shape[:-2], start)
+    chosen = []
+    for _ in range(k):
+        chosen.append(current)
+        here = torch.take_along_dim(points, current[..., None, None], dim=-2)
+        distance = torch.minimum(distance, (points - here).square().sum(-1))
+        current = (distance == distance.max(-1, keepdim=True).values).to(torch.uint8).argmax(-1)
+    return torch.stack(chosen, dim=-1) if chosen else torch.empty(*points.shape[:-2], 0, dtype=torch.long)
+
+
+def front_constraint(
+    points: Tensor, K: Tensor, cam_from_world: Tensor, depth: Tensor, *, distance: str = "chamfer"
+) -> Tensor:
+    """(B, V): one view after the other; see the public function for views without points."""
+    height, width = depth.shape[-2:]
+    _, _, visible = splat_depth(points, K, cam_from_world, height, width)
+    truth, lengths = unproject(depth, K, cam_from_world)
+    loss = []
+    for b, v in itertools.product(*map(range, depth.shape[:2])):
+        seen = points[b, visible[b, v]] if visible[b, v].any() else points[b]
+        observed = truth[b, v, : lengths[b, v]]
+        if len(observed) == 0:
+            loss.append(points.new_zeros(()))
+        elif distance == "chamfer":
+            loss.append(torch.stack(chamfer_distance(seen, observed, squared=False)).sum(0))
+        else:
+            loss.append(earth_mover_distance(seen, observed)[0])
+    return torch.stack(loss).view(depth.shape[:2])
+
+
+def projection_loss(points: Tensor, K: Tensor, cam_from_world: Tensor, depth: Tensor) -> Tensor:
+    """(B, V)."""
+    rendered, _, _ = splat_depth(points, K, cam_from_world, *depth.shape[-2:])
+    loss = []
+    for b, v in itertools.product(*map(range, depth.shape[:2])):
+        both = torch.isfinite(rendered[b, v]) & torch.isfinite(depth[b, v])
+        difference = rendered[b, v][both] - depth[b, v][both]
+        loss.append(difference.abs().mean() if both.any() else points.new_zeros(()))
+    return torch.stack(loss).view(depth.shape[:2])
+
+
+def diversity_loss(codes: Tensor, clouds: Tensor, *, alpha: float) -> Tensor:
+    """(B,)."""
+    terms = [
+        torch.relu((codes[i] - codes[j]).norm(dim=-1) - alpha * earth_mover_distance(clouds[i], clouds[j])[0])
+        for i, j in itertools.combinations(range(len(codes)), 2)
+    ]
+    return torch.stack(terms).mean(0)
+
+
+def consistency_loss(clouds: Tensor) -> Tensor:
+    """(*B)."""
+    terms = [
+        torch.stack(chamfer_distance(clouds[..., i, :, :], clouds[..., j, :, :], squared=False)).sum(0)
+        for i, j in itertools.combinations(range(clouds.shape[-3]), 2)
+    ]
+    return torch.stack(terms).mean(0)
+
+
+def _mask(points: Tensor, lengths: Tensor) -> Tensor:
+    return torch.arange(points.shape[-2]) < lengths[..., None]
+
+
+def _sqrt(x: Tensor) -> Tensor:
+    positive = x > 0
+    return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)

@@ -1,0 +1,124 @@
+"""For tests of differentiable point rendering, the reader's own included: inputs without ties, and fair comparisons.
+
+Rendering assigns points to pixels by a step function. A gradient check, or a comparison of two renderers that round
+differently, is only meaningful where no point sits on a step: `tie_free_clouds` makes such inputs, and
+`boundary_points` finds the points for which two correct renderers may disagree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from diffpoint.camera import PinholeCamera
+
+# One tolerance per dtype, relative to the size of the values: sums of a few thousand terms stay below it.
+TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-11}
+
+
+def tie_free_clouds(
+    batch: int,
+    count: int,
+    camera: PinholeCamera,
+    *,
+    seed: int,
+    dtype: torch.dtype = torch.float64,
+    margin: float = 1e-3,
+) -> Tensor:
+    """Clouds (batch, count, 3) in [-0.5, 0.5]^3 whose points lie off every pixel border of every view of `camera`.
+
+    Depths within a cloud differ by at least `margin` / 100 in every view, so that no z-buffer is a matter of rounding.
+
+    Raises:
+        ValueError: `count` points with these margins were not found.
+
+    Example:
+        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=30.0, height=16, width=16)
+        >>> tie_free_clouds(2, 20, camera, seed=0).shape
+        torch.Size([2, 20, 3])
+    """
+    generator = torch.Generator().manual_seed(seed)
+    cameras = camera.to(torch.float64)
+    clouds = []
+    for _ in range(batch):
+        points = torch.empty(0, 3, dtype=torch.float64)
+        for _ in range(200):
+            fresh = torch.rand(4 * count, 3, dtype=torch.float64, generator=generator) - 0.5
+            fresh = fresh.to(dtype).to(torch.float64)
+            fresh = fresh[
+                ~boundary_points(fresh[None], cameras, margin=margin).reshape(-1, len(fresh)).any(0)
+            ]
+            for point in fresh:
+                depths = _depth(point[None], cameras) - _depth(points, cameras)
+                if len(points) == 0 or bool((depths.abs() > margin / 100).all()):
+                    points = torch.cat((points, point[None]))
+                if len(points) == count:
+                    break
+            if len(points) == count:
+                break
+        else:
+            raise ValueError(
+                f"tie_free_clouds: no {count} points with margin {margin}; ask for fewer, or a smaller margin."
+            )
+        clouds.append(points)
+    return torch.stack(clouds).to(dtype)
+
+
+def boundary_points(points: Tensor, camera: PinholeCamera, *, margin: float = 1e-3) -> Tensor:
+    """(B, V, N) bool: points within `margin` pixels of a pixel's border, or of the camera's plane.
+
+    Example:
+        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
+        >>> boundary_points(torch.tensor([[[0.0, 0.0, 0.0], [0.25, 0.25, 0.0]]]), camera).tolist()
+        [[[True, False]]]
+    """
+    projection = camera.projection if camera.batch_shape else camera.projection[None]
+    projection = projection.expand(points.shape[0], *projection.shape[-3:])
+    ones = torch.ones_like(points[..., :1])
+    homogeneous = torch.cat((points, ones), -1)[:, None] @ projection.mT
+    depth = homogeneous[..., 2]
+    pixels = homogeneous[..., :2] / torch.where(depth == 0, 1.0, depth)[..., None]
+    return ((pixels - pixels.round()).abs() < margin).any(-1) | (depth.abs() < margin)
+
+
+def _depth(points: Tensor, camera: PinholeCamera) -> Tensor:
+    row = camera.projection[..., 2, :].reshape(-1, 4)
+    return row[:, :3] @ points.T + row[:, 3:]
+
+
+def check_gradients(function: Callable, *inputs: Tensor) -> None:
+    """Compare a function's gradients with finite differences in float64, and its first order with itself twice.
+
+    Besides `torch.autograd.gradcheck` this passes an expanded (stride 0) output gradient, as `.sum().backward()` does.
+
+    Raises:
+        AssertionError: from the comparison.
+
+    Example:
+        >>> check_gradients(lambda x: x.square(), torch.rand(3, dtype=torch.float64))
+    """
+    leaves = [x.detach().clone().requires_grad_(x.is_floating_point()) for x in inputs]
+    assert torch.autograd.gradcheck(function, leaves)
+    outputs = function(*leaves)
+    outputs = [outputs] if isinstance(outputs, Tensor) else [o for o in outputs if o.requires_grad]
+    differentiable = [x for x in leaves if x.requires_grad]
+    expanded = [torch.ones((), dtype=o.dtype).expand(o.shape) for o in outputs]
+    dense = [g.contiguous() for g in expanded]
+    for x, y in zip(
+        torch.autograd.grad(outputs, differentiable, expanded, retain_graph=True, allow_unused=True),
+        torch.autograd.grad(outputs, differentiable, dense, allow_unused=True),
+        strict=True,
+    ):
+        assert (x is None and y is None) or torch.equal(x, y)
+
+
+def assert_close(actual: Tensor, expected: Tensor, *, scale: float = 1.0) -> None:
+    """Equal up to `TOLERANCE` of the dtype times `scale`; infinities in the same places.
+
+    Example:
+        >>> assert_close(torch.tensor([1.0]), torch.tensor([1.0 + 1e-6]))
+    """
+    tolerance = TOLERANCE.get(expected.dtype, 0.0) * scale
+    torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
