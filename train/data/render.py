@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from diffpoint.camera import PinholeCamera
+from train.data.surface import Surface
 from train.errors import UserError
 
 DISTANCE = 2.0
@@ -26,39 +27,6 @@ _LIGHT_IN_CAM = np.array([-0.45, -0.7, -0.9]) / np.linalg.norm(
     [-0.45, -0.7, -0.9]
 )  # over the viewer's left shoulder
 _COLOUR_OFFSETS = np.array([(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)])
-
-
-@dataclasses.dataclass(frozen=True)
-class Surface:
-    """Triangles with colour. World frame, y up.
-
-    Attributes:
-        vertices: (V, 3) float.
-        faces: (F, 3) int.
-        corner_colours: (F, 3, 3) float32 in [0, 1]: RGB at the corners of each face.
-        face_texture: (F,) int, index into `textures`, or -1 where the corner colours hold.
-        corner_uv: (F, 3, 2) float32, v up; read where `face_texture` >= 0.
-        textures: images (h, w, 3) uint8.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    corner_colours: np.ndarray
-    face_texture: np.ndarray
-    corner_uv: np.ndarray
-    textures: tuple[np.ndarray, ...] = ()
-
-    @staticmethod
-    def plain(vertices: np.ndarray, faces: np.ndarray, face_colours: np.ndarray) -> Surface:
-        """A surface with one colour (F, 3) per face."""
-        count = len(faces)
-        return Surface(
-            vertices,
-            faces,
-            np.repeat(face_colours[:, None], 3, axis=1).astype(np.float32),
-            np.full(count, -1),
-            np.zeros((count, 3, 2), np.float32),
-        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from train.data.render import Surface
+from train.data.surface import Surface, sample_triangles
 
 _STRICTLY_INSIDE = 1e-6
 """World units; a point on a face shared by two flush solids is not inside either."""
@@ -82,17 +82,11 @@ def sample_union(solids: Sequence[Solid], count: int, rng: np.random.Generator) 
     """(count, 3) points, uniform by area on the outside of the union; none is inside another solid."""
     triangles = np.concatenate([solid.vertices[solid.faces] for solid in solids])
     owner = np.repeat(np.arange(len(solids)), [len(solid.faces) for solid in solids])
-    edges = triangles[:, 1:] - triangles[:, :1]
-    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
     planes = [_planes(solid) for solid in solids]
     kept: list[np.ndarray] = []
     missing = count
     while missing > 0:
-        face = rng.choice(len(area), size=int(missing * 1.5) + 16, p=area / area.sum())
-        weights = rng.random((len(face), 2))
-        over = weights.sum(1) > 1
-        weights[over] = 1 - weights[over]
-        points = triangles[face, 0] + np.einsum("nk,nkc->nc", weights, edges[face])
+        points, face = sample_triangles(triangles, int(missing * 1.5) + 16, rng)
         outside = np.ones(len(points), bool)
         for number, (normals, offsets) in enumerate(planes):
             candidates = np.flatnonzero(outside & (owner[face] != number))

@@ -190,3 +190,12 @@ def _remove_leftovers(root: Path) -> None:
         shutil.rmtree(scratch, ignore_errors=True)
     for scratch in (root / CLOUDS).glob("*/.*"):
         scratch.unlink(missing_ok=True)
+
+
+def discard(root: Path) -> None:
+    """Remove a dataset in which nothing could be made."""
+    for name in (RENDERS, CLOUDS, LISTS):
+        shutil.rmtree(root / name, ignore_errors=True)
+    (root / _SETTINGS).unlink(missing_ok=True)
+    if not any(root.iterdir()):
+        root.rmdir()

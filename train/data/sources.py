@@ -1,0 +1,233 @@
+"""Finding meshes in folders, archives and single files, and what to call them."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+import re
+import shutil
+import unicodedata
+import zipfile
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+
+from train.data.categories import CATEGORY_OF, SYNSET_OF, UNKNOWN, synset_of
+from train.errors import UserError
+
+MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".off", ".stl")
+ARCHIVE_SUFFIXES = (".zip", ".sh3f")
+_NO_NAMES = {"model", "models", "model_normalized", "mesh", "meshes", "object"}
+_CATALOGUE = "PluginFurnitureCatalog.properties"
+
+Rotation = tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshFile:
+    """A mesh that was found.
+
+    Attributes:
+        path: the file to load; in a scratch folder if it came out of an archive.
+        library: name of the folder or archive it came from.
+        inside: path inside the library, with forward slashes.
+        synset: folder name of its category.
+        rotation: 9 numbers, row by row, that stand the model upright and facing +z; None for as it is.
+    """
+
+    path: Path
+    library: str
+    inside: str
+    synset: str
+    rotation: Rotation | None = None
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"{self.library}: {self.inside}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Label:
+    """A line of a label file: which model of which library is what."""
+
+    library: str
+    model: str
+    synset: str
+
+
+def find_meshes(sources: Sequence[Path], scratch: Path) -> tuple[list[MeshFile], dict[str, str]]:
+    """All meshes of the sources; archives are unpacked below `scratch`.
+
+    Returns:
+        The meshes, and by name the archive members that were refused.
+
+    Raises:
+        UserError: a source that is missing, or no folder, archive or mesh.
+    """
+    meshes: list[MeshFile] = []
+    refused: dict[str, str] = {}
+    for source in sources:
+        if not source.exists():
+            raise UserError(f"no such file or folder: {source}")
+        if source.is_dir():
+            meshes += _in_folder(source, source.resolve().name)
+            archives = sorted(path for path in source.rglob("*") if path.suffix.lower() in ARCHIVE_SUFFIXES)
+        elif source.suffix.lower() in ARCHIVE_SUFFIXES:
+            archives = [source]
+        elif source.suffix.lower() in MESH_SUFFIXES:
+            meshes.append(
+                MeshFile(source, source.resolve().parent.name, source.name, _synset_from(source.parts))
+            )
+            archives = []
+        else:
+            known = ", ".join(ARCHIVE_SUFFIXES + MESH_SUFFIXES)
+            raise UserError(f"{source} is no folder and none of {known}")
+        for archive in archives:
+            folder = scratch / str(len(list(scratch.iterdir())))
+            refused |= _unpack(archive, folder)
+            meshes += _in_folder(folder, archive.name, _catalogue_rotations(folder))
+    return meshes, refused
+
+
+def _in_folder(folder: Path, library: str, rotations: dict[str, Rotation] | None = None) -> list[MeshFile]:
+    found = []
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in MESH_SUFFIXES and path.is_file():
+            inside = path.relative_to(folder).as_posix()
+            synset = _synset_from((library, *PurePosixPath(inside).parts[:-1]))
+            found.append(MeshFile(path, library, inside, synset, (rotations or {}).get(inside)))
+    return found
+
+
+def _synset_from(parts: Iterable[str]) -> str:
+    """The category that a folder on the way is named after (by name, plural or synset), the innermost first."""
+    for part in reversed(tuple(parts)):
+        for name in (part.lower(), part.lower().removesuffix("s")):
+            if name in CATEGORY_OF:
+                return name
+            if name in SYNSET_OF:
+                return SYNSET_OF[name]
+    return UNKNOWN
+
+
+def _unpack(archive: Path, folder: Path) -> dict[str, str]:
+    """Unpack an archive; a member that would land outside the folder is refused and named."""
+    refused = {}
+    folder.mkdir(parents=True)
+    try:
+        with zipfile.ZipFile(archive) as content:
+            members = [member for member in content.infolist() if not member.is_dir()]
+            if sum(member.file_size for member in members) > shutil.disk_usage(folder).free:
+                raise UserError(f"{archive} unpacks to more than the free space of {folder.parent}")
+            for member in members:
+                parts = PurePosixPath(member.filename.replace("\\", "/")).parts
+                name = f"{archive.name}: {member.filename}"
+                if ".." in parts or member.filename.startswith(("/", "\\")) or ":" in parts[0]:
+                    refused[name] = "its path leads out of the archive"
+                    continue
+                try:
+                    content.extract(member, folder)
+                except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, EOFError) as error:
+                    refused[name] = f"cannot be unpacked ({error})"
+    except zipfile.BadZipFile as error:
+        raise UserError(f"{archive} is no zip archive ({error}); fetch it again") from error
+    return refused
+
+
+def _catalogue_rotations(folder: Path) -> dict[str, Rotation]:
+    """How a Sweet Home 3D library turns its models, by path; its other models stand upright and face +z already."""
+    catalogue = folder / _CATALOGUE
+    if not catalogue.is_file():
+        return {}
+    entries = dict(re.findall(r"^(\w+#\d+)=(.*?)\s*$", catalogue.read_text("latin-1"), re.MULTILINE))
+    rotations = {}
+    for key, model in entries.items():
+        if key.startswith("model#"):
+            numbers = entries.get(key.replace("model#", "modelRotation#"), "").split()
+            if len(numbers) == 9:
+                rotations[model.lstrip("/")] = tuple(float(number) for number in numbers)
+    return rotations
+
+
+def read_labels(path: Path) -> list[Label]:
+    """Read a label file with the columns library, model and category (and synset, where the category has one).
+
+    Raises:
+        UserError: no such file, or no such columns.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"the label file {path} cannot be read ({error})") from error
+    missing = [
+        column for column in ("library", "model", "category") if not rows or rows[0].get(column) is None
+    ]
+    if missing:
+        raise UserError(f"the label file {path} has no column {', '.join(missing)}, or no lines")
+    return [
+        Label(row["library"], row["model"], row.get("synset") or synset_of(row["category"].strip()))
+        for row in rows
+    ]
+
+
+def keep_labelled(
+    meshes: Sequence[MeshFile], labels: Sequence[Label], path: Path
+) -> tuple[list[MeshFile], dict[str, str]]:
+    """The meshes that have a label, with its category; and by name the labelled ones that their library lacks.
+
+    Raises:
+        UserError: no label fits any mesh.
+    """
+    by_place = {(mesh.library, mesh.inside): mesh for mesh in meshes}
+    kept, absent = [], {}
+    libraries = {mesh.library for mesh in meshes}
+    for label in labels:
+        mesh = by_place.get((label.library, label.model))
+        if mesh is not None:
+            kept.append(dataclasses.replace(mesh, synset=label.synset))
+        elif label.library in libraries:
+            absent[f"{label.library}: {label.model}"] = (
+                "the label file names it, its library does not have it"
+            )
+    if not kept:
+        raise UserError(
+            f"no line of {path} fits the meshes: it speaks of {_some({label.library for label in labels})}, "
+            f"the sources are {_some(libraries)}"
+        )
+    return kept, absent
+
+
+def _some(names: set[str]) -> str:
+    return ", ".join(sorted(names)[:5]) or "nothing"
+
+
+def shape_ids(meshes: Sequence[MeshFile]) -> list[str]:
+    """A name "synset/model" for each mesh: unique, safe on every file system, and the same in the next run.
+
+    The model is named after its path without what says nothing; where that is not plain ASCII, or two meshes would
+    share the name, a hash of the library and the whole path follows.
+    """
+    plain = [_plain_name(mesh) for mesh in meshes]
+    uses = Counter(f"{mesh.synset}/{name.lower()}" for mesh, (name, _) in zip(meshes, plain, strict=True))
+    ids = []
+    for mesh, (name, exact) in zip(meshes, plain, strict=True):
+        if not exact or uses[f"{mesh.synset}/{name.lower()}"] > 1:
+            name = f"{name}-{hashlib.sha256(mesh.name.encode()).hexdigest()[:8]}"
+        ids.append(f"{mesh.synset}/{name}")
+    return ids
+
+
+def _plain_name(mesh: MeshFile) -> tuple[str, bool]:
+    """A name of safe characters, and whether nothing was lost on the way to it."""
+    parts = list(PurePosixPath(mesh.inside).with_suffix("").parts)
+    while len(parts) > 1 and (parts[-1].lower() in _NO_NAMES or parts[-1] == parts[-2]):
+        parts.pop()
+    if len(parts) > 1 and _synset_from(parts[:1]) == mesh.synset:
+        parts = parts[1:]
+    name = "_".join(parts)
+    ascii_name = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    safe = re.sub(r"[^A-Za-z0-9-]+", "_", ascii_name).strip("_-")[:100]
+    return safe or "model", safe == name
