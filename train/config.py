@@ -47,6 +47,8 @@ class StageConfig:
     """Weight of the diversity loss (the paper's beta)."""
     diversity_images: int
     """Images of the batch that take part in the diversity loss; fewer make a step cheaper."""
+    diversity_stride: int
+    """Every how many-th point of a cloud takes part in the diversity loss, in turns."""
     ramp: tuple[int, int]
     """Steps between which the diversity weight rises from 0 to beta: the image has to speak before the
     codes."""
@@ -139,21 +141,23 @@ class FitConfig:
 
 _FULL_STAGE1 = StageConfig(
     steps=40_000, shapes=2, views=8, codes=5, joined_views=False, front="emd", alpha=0.2, beta=10.0,
-    diversity_images=16, ramp=(1_000, 4_000), select="cd", warmup=500,
+    diversity_images=16, diversity_stride=1, ramp=(1_000, 4_000), select="cd",
+    warmup=500,
 )  # fmt: skip
 _FULL_STAGE2 = StageConfig(
     steps=100_000, shapes=2, views=8, codes=5, joined_views=True, front="chamfer", alpha=0.1, beta=1.0,
-    diversity_images=16, ramp=(0, 1), select="fps_cd", warmup=500,
+    diversity_images=16, diversity_stride=1, ramp=(0, 1), select="fps_cd",
+    warmup=500,
 )  # fmt: skip
 _CPU_STAGE1 = StageConfig(
     steps=4_000, shapes=12, views=1, codes=4, joined_views=False, front="emd", alpha=0.2, beta=10.0,
-    diversity_images=6, ramp=(400, 1_200), select="cd", learning_rate=5e-4, final_learning_rate=1e-4,
-    warmup=200,
+    diversity_images=6, diversity_stride=2, ramp=(400, 1_200), select="cd",
+    learning_rate=5e-4, final_learning_rate=1e-4, warmup=200,
 )  # fmt: skip
 _CPU_STAGE2 = StageConfig(
     steps=2_000, shapes=3, views=4, codes=4, joined_views=True, front="chamfer", alpha=0.1, beta=1.0,
-    diversity_images=6, ramp=(0, 1), select="fps_cd", learning_rate=3e-4, final_learning_rate=2e-5,
-    warmup=100,
+    diversity_images=6, diversity_stride=2, ramp=(0, 1), select="fps_cd",
+    learning_rate=3e-4, final_learning_rate=2e-5, warmup=100,
 )  # fmt: skip
 _SMOKE_STAGE1 = dataclasses.replace(
     _CPU_STAGE1, steps=30, shapes=3, views=1, codes=2, diversity_images=2, ramp=(5, 20), warmup=5

@@ -75,7 +75,8 @@ def training_step(
     diversity = torch.zeros(())
     if beta > 0:
         some = slice(0, stage.diversity_images)
-        diversity = diversity_loss(codes[:, some], clouds[:, some], alpha=stage.exact_alpha)
+        thin = slice(step % stage.diversity_stride, None, stage.diversity_stride)
+        diversity = diversity_loss(codes[:, some], clouds[:, some, thin], alpha=stage.exact_alpha)
 
     loss = (
         front.loss + beta * diversity

@@ -46,7 +46,8 @@ class Training:
             self.model.load_state_dict(weights.state_dict())
         self.stage_index, self.step = index, 0
         self.best, self._deaf_checks = math.inf, 0
-        self.optimiser = torch.optim.Adam(self.model.parameters(), lr=self.config.stages[index].learning_rate)
+        rate = self.config.stages[index].learning_rate
+        self.optimiser = torch.optim.Adam(self.model.parameters(), lr=rate, fused=True)
 
     def draw_codes(self, batch: Batch) -> Tensor:
         """(R, B*V, code_dim): every image and slot gets its own."""

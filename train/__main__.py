@@ -1,0 +1,268 @@
+"""The command line: `python -m train data|fit|reconstruct|evaluate|demo`."""
+
+from __future__ import annotations
+
+import os
+
+# Idle OpenMP threads of torch spin after every operation and slow the next kernel by 1 to 2 ms; this has to
+# be said before torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import dataclasses
+import itertools
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+
+from .config import PROFILES, FitConfig, fit_config_from_json
+from .errors import UserError
+
+# Torch and the kernels are imported by the commands, so that --help answers at once.
+
+
+@dataclasses.dataclass
+class Procedural:
+    """Generate shapes with designed ambiguity: what one view hides, it truly leaves open."""
+
+    out: Path
+    """Directory of the new data tree."""
+    shapes: int = 400
+    """How many shapes, over all categories."""
+    categories: tuple[str, ...] = ()
+    """Families to draw from, for instance `chair display`; none means all."""
+    seed: int = 0
+    """The same seed gives the same tree."""
+    size: int = 224
+    """Side of the renders in pixels; 112 is enough for the cpu profile."""
+    views: int = 8
+    """Views per shape."""
+
+    def run(self) -> None:
+        from .data.procedural import generate
+
+        report = generate(
+            self.out,
+            shapes=self.shapes,
+            categories=self.categories or None,
+            seed=self.seed,
+            size=self.size,
+            views=self.views,
+        )
+        print(report.summary())
+
+
+@dataclasses.dataclass
+class Meshes:
+    """Render meshes into a data tree: OBJ, GLB, PLY or OFF in folders, zips, .sh3f libraries or ShapeNet
+    trees."""
+
+    sources: Positional[tuple[Path, ...]]
+    """Mesh files, folders, zips or .sh3f libraries."""
+    out: Path
+    """Directory of the new data tree."""
+    labels: Path | None = None
+    """CSV that names the category of each mesh; only labelled meshes are taken then."""
+    size: int = 224
+    """Side of the renders in pixels; 112 is enough for the cpu profile."""
+    views: int = 8
+    """Views per mesh."""
+    seed: int = 0
+    """Seeds cameras, surface samples and the split."""
+
+    def run(self) -> None:
+        from .data.meshes import convert
+
+        report = convert(
+            self.sources, self.out, labels=self.labels, size=self.size, views=self.views, seed=self.seed
+        )
+        print(report.summary())
+
+
+@dataclasses.dataclass
+class Check:
+    """Look through a data tree: what is there, what is broken, whether cameras, depth and clouds agree."""
+
+    data: Positional[Path]
+    """Root of the data tree."""
+
+    def run(self) -> None:
+        from .data.check import check_tree
+
+        print(check_tree(self.data).summary())
+
+
+@dataclasses.dataclass
+class Data:
+    """Make a data tree, or look through one."""
+
+    action: OmitArgPrefixes[
+        Annotated[Procedural, subcommand("procedural")]
+        | Annotated[Meshes, subcommand("meshes")]
+        | Annotated[Check, subcommand("check")]
+    ]
+
+    def run(self) -> None:
+        self.action.run()
+
+
+@dataclasses.dataclass
+class Fit:
+    """Train a generator: stage 1 on single views, then stage 2 on joined views. Ctrl-C saves and leaves.
+
+    The defaults below are those of the profile; put --profile before --help to see another profile's.
+    """
+
+    data: Path
+    """Root of a data tree (see the `data` command)."""
+    out: Path
+    """Directory of the run: configuration, metrics, checkpoints, TensorBoard events."""
+    config: Annotated[FitConfig, arg(name="")]
+    resume: bool = False
+    """Continue the run in --out from its newest checkpoint, to the same bits."""
+    steps: int | None = None
+    """The same number of steps for both stages, for a quick trial."""
+
+    def run(self) -> int:
+        from .fit import fit
+
+        config = self.config
+        if self.steps is not None:
+            if self.steps < 1:
+                raise UserError(f"--steps must be at least 1; got {self.steps}")
+            stage1, stage2 = (
+                dataclasses.replace(stage, steps=self.steps) for stage in (config.stage1, config.stage2)
+            )
+            config = dataclasses.replace(config, stage1=stage1, stage2=stage2)
+        if not fit(self.data, self.out, config, resume=self.resume):
+            print(f"stopped early and saved; continue with --resume --out {self.out}", file=sys.stderr)
+            return 130
+        print(f"trained; see {self.out}, or run: python -m train evaluate {self.out} --data {self.data}")
+        return 0
+
+
+@dataclasses.dataclass
+class Reconstruct:
+    """Reconstruct one object from 1 to 24 pictures of it; no cameras needed.
+
+    Writes DIR/reconstruction.ply and DIR/reconstruction.html, a page with the pictures and the cloud to turn.
+    Pictures should show the object alone on white or on transparency, about three quarters of the frame.
+    """
+
+    model: Annotated[Positional[Path], arg(metavar="RUN")]
+    """A run's directory, or a .safetensors file of one."""
+    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")]
+    """Pictures of one object."""
+    out: Path
+    """Directory to write to."""
+    groups: int = 5
+    """Groups of random codes to search."""
+    steps: int = 30
+    """Gradient steps on the codes."""
+    seed: int = 0
+    """Draws the codes."""
+
+    def run(self) -> None:
+        from .reconstruction import reconstruct_to_files
+
+        reconstruct_to_files(
+            self.model, self.images, self.out, groups=self.groups, steps=self.steps, seed=self.seed
+        )
+
+
+@dataclasses.dataclass
+class Evaluate:
+    """Score a run on held-out shapes, beside two answers that need no network; writes evaluation.json."""
+
+    model: Annotated[Positional[Path], arg(metavar="RUN")]
+    """A run's directory, or a .safetensors file of one."""
+    data: Path
+    """Root of a data tree."""
+    split: Literal["train", "val", "test"] = "test"
+    """Split to score."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of codes and choice of views; the figures are means over them."""
+    views: tuple[int, ...] = (1, 2, 4, 8)
+    """Numbers of views."""
+    limit: int | None = None
+    """Score at most that many shapes."""
+    out: Path | None = None
+    """Where to write; RUN/evaluation.json if not given."""
+
+    def run(self) -> None:
+        from .evaluate import evaluate
+
+        evaluate(
+            self.model,
+            self.data,
+            split=self.split,
+            seeds=self.seeds,
+            views=self.views,
+            limit=self.limit,
+            out=self.out,
+        )
+
+
+@dataclasses.dataclass
+class Demo:
+    """The whole chain on generated shapes: data, training, evaluation, reconstruction, and a page that shows
+    it."""
+
+    out: Path = Path("demo")
+    """Directory to write to; ends with report.html."""
+
+    def run(self) -> None:
+        from .demo import demo
+
+        demo(self.out)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command; a user's mistake becomes one line on stderr and exit code 2."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        command = _parse(arguments)
+        return command.run() or 0
+    except UserError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except OSError as error:  # no permission, no space, a name that is too long: the system's words are clear
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+def _parse(arguments: list[str]) -> Any:
+    fit = Fit(data=tyro.MISSING, out=tyro.MISSING, config=_fit_defaults(arguments))
+    kinds = (
+        Annotated[Data, subcommand("data")]
+        | Annotated[Fit, subcommand("fit", default=fit)]
+        | Annotated[Reconstruct, subcommand("reconstruct")]
+        | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Demo, subcommand("demo")]
+    )
+    return tyro.cli(
+        OmitSubcommandPrefixes[kinds],  # type: ignore[arg-type]
+        args=arguments,
+        prog="python -m train",
+        description="Learn to turn one image and a random code into a shape, and several images into one.",
+    )
+
+
+def _fit_defaults(arguments: list[str]) -> FitConfig:
+    """The configuration that the other options of `fit` change: the resumed run's, or the profile's."""
+    given = dict(itertools.pairwise(arguments))
+    given |= dict(a.split("=", 1) for a in arguments if a.startswith("--") and "=" in a)
+    saved = Path(given.get("--out", "")) / "config.json"
+    if arguments[:1] == ["fit"] and "--resume" in arguments and saved.is_file():
+        return fit_config_from_json(saved.read_text(), where=str(saved))
+    return PROFILES.get(given.get("--profile", "cpu"), PROFILES["cpu"])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

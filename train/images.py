@@ -1,0 +1,66 @@
+"""Pictures from anywhere -> what the network expects: RGB on white, square, in [0, 1]."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from .errors import UserError
+
+
+def read_images(paths: Sequence[Path], *, size: int = 224) -> Tensor:
+    """Reads pictures of one object, composites transparency on white and pads each to a centred square.
+
+    Args:
+        paths: image files of any size, grey or colour, 8 or 16 bits, with or without alpha.
+        size: side to which the squares are resized.
+
+    Returns:
+        (V, 3, size, size) float32 in [0, 1].
+
+    Raises:
+        UserError: a file is missing or is no image.
+    """
+    squares = [_square(_read(path)) for path in paths]
+    return torch.cat(
+        [
+            F.interpolate(square[None], size=(size, size), mode="bilinear", antialias=True).clamp(0, 1)
+            for square in squares
+        ]
+    )
+
+
+def _read(path: Path) -> Tensor:
+    """(3, H, W) in [0, 1] on white."""
+    if not path.is_file():
+        raise UserError(f"{path} does not exist or is no file; name the images to reconstruct from")
+    try:
+        pixels = imageio.imread(path)
+    except Exception as error:  # every decoder has its own exceptions; all mean that this is no image
+        reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+        raise UserError(f"{path} is not an image that can be read ({reason})") from None
+    if pixels.ndim == 4:  # an animation: its first frame
+        pixels = pixels[0]
+    pixels = np.atleast_3d(pixels)
+    if pixels.ndim != 3 or pixels.shape[2] > 4 or 0 in pixels.shape:
+        raise UserError(f"{path} is not an image of 1 to 4 channels; it has shape {pixels.shape}")
+    top = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1.0
+    values = np.asarray(pixels, np.float32) / np.float32(top)
+    if values.shape[2] in (2, 4):
+        alpha = values[..., -1:]
+        values = values[..., :-1] * alpha + (1 - alpha)
+    values = np.broadcast_to(values, (*values.shape[:2], 3)) if values.shape[2] == 1 else values
+    return torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))
+
+
+def _square(image: Tensor) -> Tensor:
+    height, width = image.shape[1:]
+    side = max(height, width)
+    left, top = (side - width) // 2, (side - height) // 2
+    return F.pad(image, (left, side - width - left, top, side - height - top), value=1.0)

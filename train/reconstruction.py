@@ -1,0 +1,50 @@
+"""The `reconstruct` command: pictures in, a point cloud and a page to look at out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import trimesh
+
+from .checkpoint import load_generator
+from .errors import UserError
+from .files import replacing
+from .images import read_images
+from .inference import reconstruct
+
+MOST_IMAGES = 24
+
+
+def reconstruct_to_files(
+    run: Path, images: Sequence[Path], out: Path, *, groups: int = 5, steps: int = 30, seed: int = 0
+) -> None:
+    """Reconstructs one object and writes reconstruction.ply and reconstruction.html into `out`.
+
+    Everything is read and computed before anything is written.
+
+    Raises:
+        UserError: a run that is no run, an image that is no image, or a wrong number of either.
+    """
+    from .pages import write_reconstruction_page
+
+    if not 1 <= len(images) <= MOST_IMAGES:
+        raise UserError(f"reconstruct takes 1 to {MOST_IMAGES} images; got {len(images)}")
+    if groups < 1 or steps < 0:
+        raise UserError(f"--groups must be at least 1 and --steps at least 0; got {groups} and {steps}")
+    if out.exists() and not out.is_dir():
+        raise UserError(f"{out} is a file; --out names a directory")
+    model = load_generator(run)
+    pictures = read_images(images)
+    found = reconstruct(model, pictures, groups=groups, steps=steps, seed=seed)
+    points = found.points[0]
+    made = f"{len(points)} points from {len(images)} image{'s' if len(images) > 1 else ''}"
+    if len(found.history):
+        before, after = found.history[0, 0].item(), found.history[-1, 0].item()
+        made += f"; the views' disagreement (chamfer x100) fell from {before:.2f} to {after:.2f}"
+
+    with replacing(out / "reconstruction.ply") as cloud, replacing(out / "reconstruction.html") as page:
+        ply = trimesh.PointCloud(points.numpy()).export(file_type="ply")
+        cloud.write_bytes(ply if isinstance(ply, bytes) else str(ply).encode())
+        write_reconstruction_page(page, pictures, points, title="Reconstruction", subtitle=made)
+    print(f"wrote {out}/reconstruction.ply and {out}/reconstruction.html: {made}")
