@@ -131,8 +131,8 @@ def _nearest_setup(ctx, inputs, output) -> None:
 
 
 def _nearest_gradient(ctx, grad_squared_distance: Tensor, _grad_index):
-    grad_a, grad_b = _nearest_backward(*ctx.saved_tensors, grad_squared_distance)
-    return grad_a, grad_b, None, None, None, None
+    a, b, index = ctx.saved_tensors
+    return *_nearest_backward(a, b, index, grad_squared_distance), None, None, None, None
 
 
 @_bridge.register("nearest", fake=_nearest_fake, backward=_nearest_gradient, setup=_nearest_setup)

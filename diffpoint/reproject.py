@@ -148,7 +148,8 @@ def _project_setup(ctx, inputs, output) -> None:
 
 
 def _project_gradient(ctx, grad_pixels: Tensor, grad_depth: Tensor):
-    return *_project_backward(*ctx.saved_tensors, grad_pixels, grad_depth), None
+    points, projection = ctx.saved_tensors
+    return *_project_backward(points, projection, grad_pixels, grad_depth), None
 
 
 @_bridge.register("project", fake=_project_fake, backward=_project_gradient, setup=_project_setup)
@@ -208,7 +209,8 @@ def _unproject_setup(ctx, inputs, output) -> None:
 
 
 def _unproject_gradient(ctx, grad_points: Tensor, _grad_lengths):
-    return *_unproject_backward(*ctx.saved_tensors, grad_points, ctx.compact), None, None
+    depth, back_projection = ctx.saved_tensors
+    return *_unproject_backward(depth, back_projection, grad_points, ctx.compact), None, None
 
 
 @_bridge.register("unproject", fake=_unproject_fake, backward=_unproject_gradient, setup=_unproject_setup)

@@ -79,7 +79,8 @@ def _splat_setup(ctx, inputs, output) -> None:
 
 
 def _splat_gradient(ctx, grad_depth: Tensor, _grad_index, _grad_visible):
-    grad_points, grad_projection = _splat_backward(*ctx.saved_tensors, grad_depth)
+    points, projection, index = ctx.saved_tensors
+    grad_points, grad_projection = _splat_backward(points, projection, index, grad_depth)
     return grad_points, None, grad_projection, None, None, None
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from diffpoint import _checks
 from diffpoint.camera import PinholeCamera
 
 # One tolerance per dtype, relative to the size of the values: sums of a few thousand terms stay below it.
@@ -40,29 +41,23 @@ def tie_free_clouds(
         torch.Size([2, 20, 3])
     """
     generator = torch.Generator().manual_seed(seed)
-    cameras = camera.to(torch.float64)
+    views = _checks.check_views("tie_free_clouds", "camera", camera.to(torch.float64), batch)
     clouds = []
-    for _ in range(batch):
-        points = torch.empty(0, 3, dtype=torch.float64)
-        for _ in range(200):
-            fresh = torch.rand(4 * count, 3, dtype=torch.float64, generator=generator) - 0.5
-            fresh = fresh.to(dtype).to(torch.float64)
-            fresh = fresh[
-                ~boundary_points(fresh[None], cameras, margin=margin).reshape(-1, len(fresh)).any(0)
-            ]
-            for point in fresh:
-                depths = _depth(point[None], cameras) - _depth(points, cameras)
-                if len(points) == 0 or bool((depths.abs() > margin / 100).all()):
-                    points = torch.cat((points, point[None]))
-                if len(points) == count:
-                    break
-            if len(points) == count:
-                break
-        else:
+    for cloud in range(batch):
+        points = torch.rand(8 * count, 3, dtype=torch.float64, generator=generator) - 0.5
+        points = points.to(dtype).to(torch.float64)
+        for view in range(views.batch_shape[1]):
+            camera_here = views[cloud, view]
+            points = points[~boundary_points(points[None], camera_here, margin=margin)[0, 0]]
+            depth, order = (points @ camera_here.projection[2, :3]).sort()
+            gap = depth.diff(prepend=depth[:1] - 1)
+            points = points[order[gap > margin / 100].sort().values]
+        if len(points) < count:
             raise ValueError(
-                f"tie_free_clouds: no {count} points with margin {margin}; ask for fewer, or a smaller margin."
+                f"tie_free_clouds: only {len(points)} of {count} points found with margin {margin}; "
+                "ask for fewer, or a smaller margin."
             )
-        clouds.append(points)
+        clouds.append(points[:count])
     return torch.stack(clouds).to(dtype)
 
 
@@ -74,18 +69,12 @@ def boundary_points(points: Tensor, camera: PinholeCamera, *, margin: float = 1e
         >>> boundary_points(torch.tensor([[[0.0, 0.0, 0.0], [0.25, 0.25, 0.0]]]), camera).tolist()
         [[[True, False]]]
     """
-    projection = camera.projection if camera.batch_shape else camera.projection[None]
-    projection = projection.expand(points.shape[0], *projection.shape[-3:])
+    projection = _checks.check_views("boundary_points", "camera", camera, points.shape[0]).projection
     ones = torch.ones_like(points[..., :1])
     homogeneous = torch.cat((points, ones), -1)[:, None] @ projection.mT
     depth = homogeneous[..., 2]
     pixels = homogeneous[..., :2] / torch.where(depth == 0, 1.0, depth)[..., None]
     return ((pixels - pixels.round()).abs() < margin).any(-1) | (depth.abs() < margin)
-
-
-def _depth(points: Tensor, camera: PinholeCamera) -> Tensor:
-    row = camera.projection[..., 2, :].reshape(-1, 4)
-    return row[:, :3] @ points.T + row[:, 3:]
 
 
 def check_gradients(function: Callable, *inputs: Tensor) -> None:

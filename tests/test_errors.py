@@ -1,0 +1,172 @@
+"""Every op refuses what it cannot take, and says which argument, what was expected and what came."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+import diffpoint as dp
+
+CAMERA = dp.PinholeCamera.look_at(torch.tensor([[0.0, 0, -2], [2, 0, 0]]), focal_px=20.0, height=8, width=8)
+DEPTH = torch.full((2, 2, 8, 8), 2.0)
+Ops = dict[str, Callable]
+
+# Each op with one cloud-like argument left open.
+CLOUDS: Ops = {
+    "splat_depth": lambda x: dp.splat_depth(x, CAMERA),
+    "project": lambda x: dp.project(x, CAMERA),
+    "front_constraint": lambda x: dp.front_constraint(x, CAMERA, DEPTH),
+    "projection_loss": lambda x: dp.projection_loss(x, CAMERA, DEPTH),
+}
+SETS: Ops = {
+    "nearest a": lambda x: dp.nearest(x, torch.rand(2, 5, 3)),
+    "nearest b": lambda x: dp.nearest(torch.rand(2, 5, 3), x),
+    "chamfer_distance a": lambda x: dp.chamfer_distance(x, torch.rand(2, 5, 3), squared=True),
+    "chamfer_distance b": lambda x: dp.chamfer_distance(torch.rand(2, 5, 3), x, squared=True),
+    "earth_mover_distance a": lambda x: dp.earth_mover_distance(x, torch.rand(2, 5, 3)),
+    "earth_mover_distance b": lambda x: dp.earth_mover_distance(torch.rand(2, 5, 3), x),
+    "farthest_point_sample points": lambda x: dp.farthest_point_sample(x, 2),
+}
+STACKS: Ops = {
+    "diversity_loss clouds": lambda x: dp.diversity_loss(
+        torch.rand(2, 2, 4), x[None].expand(2, *x.shape), alpha=1.0
+    ),
+    "consistency_loss clouds": lambda x: dp.consistency_loss(x[:, None].expand(-1, 2, *x.shape[1:])),
+}
+MAPS: Ops = {
+    "unproject": lambda d: dp.unproject(d, CAMERA),
+    "reproject": lambda d: dp.reproject(d, CAMERA, CAMERA),
+    "front_constraint": lambda d: dp.front_constraint(torch.rand(2, 9, 3), CAMERA, d),
+    "projection_loss": lambda d: dp.projection_loss(torch.rand(2, 9, 3), CAMERA, d),
+}
+EVERY = CLOUDS | SETS | STACKS
+
+
+@pytest.mark.parametrize("op", EVERY)
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_coordinates_that_are_not_finite(op, bad):
+    points = torch.rand(2, 7, 3)
+    points[1, 3, 2] = bad
+    with pytest.raises(ValueError, match=r"must be finite; got -?(nan|inf) at index \(.*3, 2\)"):
+        EVERY[op](points)
+
+
+@pytest.mark.parametrize("op", CLOUDS | SETS)
+def test_wrong_last_dimension(op):
+    with pytest.raises(ValueError, match=r"must have shape .*; got \(2, 7, 4\)"):
+        (CLOUDS | SETS)[op](torch.rand(2, 7, 4))
+
+
+@pytest.mark.parametrize("op", CLOUDS)
+def test_a_forgotten_batch_dimension_gets_a_hint(op):
+    with pytest.raises(ValueError, match="Did you forget to batch"):
+        CLOUDS[op](torch.rand(7, 3))
+
+
+@pytest.mark.parametrize("op", EVERY)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64])
+def test_other_dtypes(op, dtype):
+    with pytest.raises(TypeError, match="must be float32 or float64; got torch"):
+        EVERY[op](torch.ones(2, 7, 3, dtype=dtype))
+
+
+@pytest.mark.parametrize("op", CLOUDS)
+def test_mixed_dtypes(op):
+    with pytest.raises(TypeError, match="must have the dtype of"):
+        CLOUDS[op](torch.rand(2, 7, 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("op", CLOUDS | SETS)
+def test_what_is_no_tensor(op):
+    with pytest.raises(TypeError, match=r"must be a torch\.Tensor; got list"):
+        (CLOUDS | SETS)[op]([[0.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("op", MAPS)
+def test_depth_maps_of_another_size(op):
+    with pytest.raises(ValueError, match="'depth' must have"):
+        MAPS[op](torch.full((2, 2, 8, 9), 2.0))
+
+
+@pytest.mark.parametrize("op", ["unproject", "reproject", "front_constraint"])
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan")])
+def test_depths_that_are_none(op, bad):
+    depth = DEPTH.clone()
+    depth[1, 0, 2, 3] = bad
+    with pytest.raises(ValueError, match=r"'depth' must be positive.* at index \(1, 0, 2, 3\).*masked_fill"):
+        MAPS[op](depth)
+
+
+def test_empty_sets_have_no_distance():
+    full, empty = torch.rand(2, 5, 3), torch.rand(2, 0, 3)
+    for function in (
+        lambda a, b, **k: dp.chamfer_distance(a, b, squared=False, **k),
+        dp.earth_mover_distance,
+    ):
+        for a, b in ((full, empty), (empty, full)):
+            with pytest.raises(ValueError, match="must hold at least one point"):
+                function(a, b)
+        with pytest.raises(ValueError, match=r"'b_lengths' must lie in \[1, 5\]; got 0 at flat index 1"):
+            function(full, full, b_lengths=torch.tensor([3, 0]))
+
+
+@pytest.mark.parametrize(
+    ("lengths", "message"),
+    [
+        (torch.tensor([5, 6]), r"must lie in \[0, 5\]; got 6"),
+        (torch.tensor([-1, 2]), r"must lie in \[0, 5\]; got -1"),
+        (torch.tensor([1, 2, 3]), r"must have shape \(2,\); got \(3,\)"),
+        (torch.tensor([1.0, 2.0]), "must be an integer tensor"),
+        ([1, 2], "must be an integer tensor .*; got list"),
+    ],
+)
+def test_lengths_that_are_none(lengths, message):
+    points = torch.rand(2, 5, 3)
+    for call in (
+        lambda: dp.splat_depth(points, CAMERA, lengths=lengths),
+        lambda: dp.nearest(points, points, a_lengths=lengths),
+        lambda: dp.farthest_point_sample(points, 0, lengths=lengths),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            call()
+
+
+def test_batches_that_do_not_match():
+    with pytest.raises(ValueError, match=r"'b' must have shape \(4, M, 3\) to match 'a'; got \(2, 9, 3\)"):
+        dp.chamfer_distance(torch.rand(4, 9, 3), torch.rand(2, 9, 3), squared=False)
+    with pytest.raises(ValueError, match=r"'camera' must have batch shape .*\(3, V\); got \(2, 2\)"):
+        dp.splat_depth(torch.rand(3, 9, 3), CAMERA.expand(2, 2))
+    splat = dp.splat_depth(torch.rand(2, 9, 3), CAMERA)
+    with pytest.raises(ValueError, match="Pass the cloud that splat_depth rendered"):
+        dp.sample_view(torch.rand(2, 10, 3), splat)
+    with pytest.raises(TypeError, match="must be the result of splat_depth"):
+        dp.sample_view(torch.rand(2, 9, 3), splat.depth)
+
+
+def test_options_out_of_range():
+    points = torch.rand(2, 5, 3)
+    for call, message in (
+        (lambda: dp.splat_depth(points, CAMERA, radius=-1.0), "'radius' must be a finite number"),
+        (lambda: dp.splat_depth(points, CAMERA, radius=float("nan")), "'radius' must be a finite number"),
+        (lambda: dp.farthest_point_sample(points, 6), "'k' must be at most 5"),
+        (lambda: dp.farthest_point_sample(points, -1), "'k' must be an integer of at least 0"),
+        (lambda: dp.farthest_point_sample(points, 2, start=5), "'start' must be at most 4"),
+        (lambda: dp.earth_mover_distance(points, points, tolerance=0.0), "'tolerance' must lie between"),
+        (
+            lambda: dp.front_constraint(points, CAMERA, DEPTH, distance="l2"),
+            "'distance' must be one of 'chamfer', 'emd'",
+        ),
+        (lambda: dp.projection_loss(points, CAMERA, DEPTH, reduction="sum"), "'reduction' must be one of"),
+        (lambda: dp.consistency_loss(points[:, None]), "'clouds' must hold at least two"),
+        (
+            lambda: dp.diversity_loss(torch.rand(1, 2, 4), points[None], alpha=1.0),
+            "'codes' must hold at least two",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+def test_tensors_elsewhere():
+    with pytest.raises(ValueError, match=r"must have shape|must be on the CPU"):
+        dp.nearest(torch.rand(2, 5, 3), torch.rand(2, 5, 2, device="meta"))

@@ -1,0 +1,164 @@
+"""The four losses: against their plain twins, and what the paper claims of their gradients."""
+
+import itertools
+import warnings
+
+import pytest
+import torch
+
+import diffpoint as dp
+from diffpoint import reference
+from diffpoint.testing import assert_close, check_gradients, tie_free_clouds
+
+DTYPES = (torch.float32, torch.float64)
+
+
+def camera(dtype: torch.dtype = torch.float64) -> dp.PinholeCamera:
+    eyes = torch.tensor([[0.1, 0.3, -2.0], [2.0, -0.4, 0.2]], dtype=dtype)
+    return dp.PinholeCamera.look_at(eyes, focal_px=21.0, height=14, width=16)
+
+
+def scene(dtype: torch.dtype = torch.float64, count: int = 80) -> tuple[torch.Tensor, torch.Tensor]:
+    """Predicted clouds, and depth maps of other clouds."""
+    truth = tie_free_clouds(2, 120, camera(), seed=1, dtype=dtype) * 0.8
+    points = tie_free_clouds(2, count, camera(), seed=2, dtype=dtype)
+    return points.requires_grad_(), dp.splat_depth(truth, camera(dtype)).depth
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("distance", ["chamfer", "emd"])
+def test_front_constraint_equals_its_twin(dtype, distance):
+    points, depth = scene(dtype)
+    view = camera(dtype)
+    K, cam_from_world = (m.expand(2, *m.shape) for m in (view.K, view.cam_from_world))
+    ours = dp.front_constraint(points, view, depth, distance=distance, tolerance=1e-5, reduction="none")
+    theirs = reference.front_constraint(points, K, cam_from_world, depth, distance=distance)
+    assert_close(ours, theirs, scale=10)
+    assert_close(dp.front_constraint(points, view, depth, distance=distance, tolerance=1e-5), ours.mean())
+    weights = torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=dtype)
+    x = torch.autograd.grad((ours * weights).sum(), points)[0]
+    y = torch.autograd.grad((theirs * weights).sum(), points)[0]
+    assert_close(x, y, scale=20)
+    hidden = ~dp.splat_depth(points, view).visible.any(1)
+    assert hidden.any()
+    assert (x[hidden] == 0).all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_projection_loss_equals_its_twin(dtype):
+    points, depth = scene(dtype)
+    view = camera(dtype)
+    K, cam_from_world = (m.expand(2, *m.shape) for m in (view.K, view.cam_from_world))
+    ours = dp.projection_loss(points, view, depth, reduction="none")
+    theirs = reference.projection_loss(points, K, cam_from_world, depth)
+    assert_close(ours, theirs, scale=10)
+    x, y = (torch.autograd.grad(loss.sum(), points)[0] for loss in (ours, theirs))
+    assert_close(x, y, scale=20)
+
+
+def test_losses_pass_gradcheck():
+    points, depth = scene(count=15)
+    for distance in ("chamfer", "emd"):
+        check_gradients(
+            lambda p, d=distance: dp.front_constraint(p, camera(), depth, distance=d, tolerance=1e-6), points
+        )
+    check_gradients(lambda p: dp.projection_loss(p, camera(), depth), points)
+    codes = torch.rand(3, 2, 5, dtype=torch.float64)
+    clouds = torch.rand(3, 2, 8, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    check_gradients(lambda c, s: dp.diversity_loss(c, s, alpha=0.3, tolerance=1e-6), codes, clouds)
+    check_gradients(lambda s: dp.consistency_loss(s, reduction="none"), clouds.transpose(0, 1))
+
+
+def test_the_projection_loss_moves_points_along_the_optical_axis_only_and_the_front_constraint_does_not():
+    """In the camera's frame: x and y of the projection loss's gradient are zero to the last bit."""
+    view = dp.PinholeCamera(torch.tensor([[30.0, 0, 8], [0, 30.0, 7], [0, 0, 1]]), torch.eye(4), 14, 16)
+    generator = torch.Generator().manual_seed(3)
+    truth = torch.rand(1, 500, 3, generator=generator) * 0.6 + torch.tensor([-0.3, -0.3, 1.5])
+    points = (
+        torch.rand(1, 500, 3, generator=generator) * 0.8 + torch.tensor([-0.4, -0.4, 1.5])
+    ).requires_grad_()
+    depth = dp.splat_depth(truth, view).depth
+    (projection,) = torch.autograd.grad(dp.projection_loss(points, view, depth), points)
+    (front,) = torch.autograd.grad(dp.front_constraint(points, view, depth), points)
+    assert (projection[..., :2] == 0).all()
+    assert (projection[..., 2] != 0).any()
+    assert front[..., :2].norm() / front.norm() > 0.3
+    outside = torch.isinf(depth)[0, 0][
+        tuple(dp.project(points, view).pixels[0, 0].long().T.flip(0).clamp(min=0, max=13))
+    ]
+    visible = dp.splat_depth(points, view).visible[0, 0]
+    assert (projection[0, outside & visible] == 0).all()
+    assert (front[0, outside & visible].norm(dim=-1) > 0).all()
+
+
+def test_front_sets_compare_what_the_views_show():
+    points, depth = scene(torch.float32)
+    sets = dp.front_sets(points, camera(torch.float32), depth)
+    assert torch.equal(sets.predicted_lengths, dp.splat_depth(points, camera(torch.float32)).visible.sum(-1))
+    assert torch.equal(sets.observed_lengths, torch.isfinite(depth).sum((-2, -1)))
+    assert sets.observed.shape[2] == sets.observed_lengths.max()
+    assert not sets.fallback.any()
+
+
+def test_a_cloud_out_of_sight_is_pulled_into_view():
+    _, depth = scene(torch.float32)
+    away = torch.full((2, 10, 3), 50.0).add_(torch.rand(2, 10, 3)).requires_grad_()
+    for distance in ("chamfer", "emd"):
+        with pytest.warns(RuntimeWarning, match="no predicted point is visible"):
+            loss = dp.front_constraint(away, camera(torch.float32), depth, distance=distance)
+        (gradient,) = torch.autograd.grad(loss, away)
+        assert torch.isfinite(loss)
+        assert (gradient.sum(1) > 0).all()  # a step against it leads back to the origin
+
+
+def test_an_empty_depth_map_constrains_nothing_and_says_so():
+    points, depth = scene(torch.float32)
+    depth[0, 1] = torch.inf
+    with pytest.warns(RuntimeWarning, match="the depth map is empty"):
+        loss = dp.front_constraint(points, camera(torch.float32), depth, reduction="none")
+    assert loss[0, 1] == 0
+    assert (loss[[0, 1, 1], [0, 0, 1]] > 0).all()
+    assert torch.isfinite(torch.autograd.grad(loss.sum(), points)[0]).all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        assert dp.front_constraint(points, camera(torch.float32), torch.full_like(depth, torch.inf)) == 0
+    assert dp.projection_loss(points, camera(torch.float32), torch.full_like(depth, torch.inf)) == 0
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_diversity_loss_equals_its_twin(dtype):
+    generator = torch.Generator().manual_seed(0)
+    codes = torch.randn(4, 2, 16, generator=generator, dtype=dtype)
+    clouds = torch.rand(4, 2, 20, 3, generator=generator, dtype=dtype).requires_grad_()
+    alpha = 20.0
+    ours = dp.diversity_loss(codes, clouds, alpha=alpha, tolerance=1e-5, reduction="none")
+    theirs = reference.diversity_loss(codes, clouds, alpha=alpha)
+    assert (theirs > 0).all()
+    assert_close(ours, theirs, scale=10)
+    x, y = (torch.autograd.grad(loss.sum(), clouds)[0] for loss in (ours, theirs))
+    assert_close(x, y, scale=50)
+
+
+def test_diversity_is_satisfied_by_shapes_that_differ_enough():
+    codes = torch.tensor([[[0.0]], [[2.0]]])
+    clouds = torch.zeros(2, 1, 6, 3)
+    clouds[1, ..., 0] = 0.5
+    assert dp.diversity_loss(codes, clouds, alpha=4.0).item() == pytest.approx(0.0, abs=1e-6)
+    assert dp.diversity_loss(codes, clouds, alpha=3.0).item() == pytest.approx(0.5, rel=1e-5)
+    assert dp.diversity_loss(codes, clouds[:1].expand(2, -1, -1, -1), alpha=4.0).item() == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_consistency_loss_equals_its_twin_and_is_zero_for_agreement(dtype):
+    clouds = torch.rand(2, 4, 25, 3, generator=torch.Generator().manual_seed(0), dtype=dtype).requires_grad_()
+    ours, theirs = dp.consistency_loss(clouds, reduction="none"), reference.consistency_loss(clouds)
+    assert ours.shape == (2,)
+    assert_close(ours, theirs)
+    x, y = (torch.autograd.grad(loss.sum(), clouds)[0] for loss in (ours, theirs))
+    assert_close(x, y, scale=20)
+    pairs = [
+        sum(dp.chamfer_distance(clouds[0, i], clouds[0, j], squared=False))
+        for i, j in itertools.combinations(range(4), 2)
+    ]
+    assert_close(ours[0], torch.stack(pairs).mean())
+    assert dp.consistency_loss(clouds[:, :1].expand(-1, 3, -1, -1)) == 0

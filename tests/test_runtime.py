@@ -1,0 +1,167 @@
+"""The runtime in fresh processes: silent, lazy, polite to a host program's Taichi, clear after a fork."""
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+USE = "import torch, diffpoint as dp; d = lambda: dp.nearest(torch.zeros(1, 4, 3), torch.ones(1, 5, 3))\n"
+
+
+def run(code: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+    script = USE + textwrap.dedent(code)
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=timeout)
+
+
+def printed(code: str) -> str:
+    done = run(code)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout.strip()
+
+
+def test_importing_starts_nothing_and_the_first_op_is_silent():
+    code = """
+        import sys
+        assert "taichi" not in sys.modules
+        assert dp.runtime_info().owner == "nobody" and not dp.runtime_info().started
+        d()
+        print(dp.runtime_info().owner)
+    """
+    assert printed(code) == "diffpoint"
+
+
+def test_threads_are_configured_before_the_start_and_refused_after():
+    code = """
+        dp.configure(threads=1)
+        d()
+        print(dp.runtime_info().threads)
+        try:
+            dp.configure(threads=2)
+        except RuntimeError as error:
+            print(error)
+    """
+    threads, error = printed(code).splitlines()
+    assert threads == "1"
+    assert "call configure() before the first op" in error
+
+
+def test_a_thread_count_below_one_is_refused():
+    assert "'threads' must be a positive integer" in run("dp.configure(threads=0)").stderr
+
+
+HOST = """
+    import contextlib, io, os, time
+    import taichi as ti
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(arch=ti.cpu, log_level=ti.ERROR)
+    field = ti.field(ti.f32, shape=3)
+    field.fill(7)
+"""
+
+
+def test_a_host_programs_taichi_is_used_and_left_alone():
+    code = """
+        result = d()
+        assert result.squared_distance.tolist() == [[3.0] * 4], result
+        assert dp.runtime_info().owner == "host"
+        print(field.to_numpy().tolist())
+    """
+    assert printed(textwrap.dedent(HOST) + textwrap.dedent(code)).endswith("[7.0, 7.0, 7.0]")
+
+
+def test_a_host_that_starts_taichi_after_us_gets_right_results_too():
+    code = """
+        assert d().squared_distance.tolist() == [[3.0] * 4]
+        print(d().squared_distance.tolist(), dp.runtime_info().owner, field.to_numpy().tolist())
+    """
+    first = "assert d().index.tolist() == [[0] * 4]\n"
+    assert printed(first + textwrap.dedent(HOST) + textwrap.dedent(code)).endswith("host [7.0, 7.0, 7.0]")
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="reads the CPU time of threads from /proc")
+def test_kernels_are_parallel_in_a_host_programs_taichi():
+    """80 clouds are fewer than the 512 iterations that Taichi's default settings keep on one thread."""
+    code = """
+        def ticks():
+            """CPU time of each thread in hundredths of a second."""
+            stat = {t: open(f"/proc/self/task/{t}/stat").read() for t in os.listdir("/proc/self/task")}
+            return {t: int(line.rsplit(")", 1)[1].split()[11]) for t, line in stat.items()}
+
+        clouds = torch.rand(80, 4000, 3)
+        dp.farthest_point_sample(clouds, 2)
+        before = ticks()
+        dp.farthest_point_sample(clouds, 1000)
+        busy = sorted((t - before.get(name, 0) for name, t in ticks().items()), reverse=True)
+        print("parallel" if len(os.sched_getaffinity(0)) < 2 or busy[1] > 0.25 * busy[0] else f"serial {busy}")
+    """
+    assert printed(textwrap.dedent(HOST) + textwrap.dedent(code)).splitlines()[-1] == "parallel"
+
+
+@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="no fork on this system")
+def test_a_forked_child_gets_an_error_instead_of_a_hang():
+    code = """
+        import os, sys, warnings
+        warnings.simplefilter("ignore")
+        d()
+        child = os.fork()
+        if child == 0:
+            try:
+                d()
+            except RuntimeError as error:
+                print(error, flush=True)
+                os._exit(3)
+            os._exit(0)
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    """
+    output = printed(code)
+    assert output.endswith("\n3")
+    assert "forked after Taichi had started" in output
+    assert "spawn" in output
+
+
+@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="no fork on this system")
+def test_a_child_forked_before_the_start_works():
+    code = """
+        import os, warnings
+        warnings.simplefilter("ignore")
+        child = os.fork()
+        if child == 0:
+            os._exit(0 if d().index.tolist() == [[0] * 4] else 1)
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    """
+    assert printed(code) == "0"
+
+
+def test_four_python_threads_at_once():
+    code = """
+        from concurrent.futures import ThreadPoolExecutor
+        a, b = torch.rand(3, 50, 3), torch.rand(3, 70, 3)
+        alone = dp.nearest(a, b).index
+        with ThreadPoolExecutor(4) as pool:
+            results = list(pool.map(lambda _: dp.nearest(a, b).index, range(40)))
+        print(all(torch.equal(alone, r) for r in results))
+    """
+    assert printed(code) == "True"
+
+
+def test_one_thread_and_two_give_the_same_bits():
+    code = """
+        import hashlib, sys
+        dp.configure(threads=THREADS)
+        g = torch.Generator().manual_seed(0)
+        a = (torch.rand(5, 300, 3, generator=g) - 0.5).requires_grad_()
+        b = (torch.rand(5, 400, 3, generator=g) - 0.5).requires_grad_()
+        camera = dp.PinholeCamera.look_at(torch.tensor([[0.0, 0, -2], [2, 0, 0]]), focal_px=40.0, height=20, width=20)
+        depth = dp.splat_depth(b.detach(), camera, radius=1.0).depth
+        terms = [dp.front_constraint(a, camera, depth, distance=d) for d in ("chamfer", "emd")]
+        terms += [dp.projection_loss(a, camera, depth), dp.earth_mover_distance(a, b).cost.sum()]
+        terms += [dp.consistency_loss(torch.stack((a, a + 0.1, a - 0.1), 1))]
+        total = sum(terms)
+        total.backward()
+        bits = [t.detach() for t in terms] + [a.grad, b.grad, dp.farthest_point_sample(a, 50), depth]
+        print(hashlib.sha256(b"".join(t.numpy().tobytes() for t in bits)).hexdigest())
+    """
+    assert printed(code.replace("THREADS", "1")) == printed(code.replace("THREADS", "2"))
