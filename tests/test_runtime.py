@@ -86,7 +86,7 @@ def test_kernels_are_parallel_in_a_host_programs_taichi():
     """80 clouds are fewer than the 512 iterations that Taichi's default settings keep on one thread."""
     code = """
         def ticks():
-            """CPU time of each thread in hundredths of a second."""
+            # CPU time of each thread in hundredths of a second.
             stat = {t: open(f"/proc/self/task/{t}/stat").read() for t in os.listdir("/proc/self/task")}
             return {t: int(line.rsplit(")", 1)[1].split()[11]) for t, line in stat.items()}
 
