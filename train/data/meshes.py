@@ -77,7 +77,7 @@ def convert(
         sources: folders, .zip and .sh3f archives, and mesh files (OBJ with its materials, GLB, PLY, OFF, STL).
         out: folder of the dataset.
         labels: CSV with the columns library, model, category, synset; only the meshes it names are made. Without
-            one, the category is that of a folder on the mesh's path (a name of the paper's or a synset), else "unknown".
+            one, the category is that of a folder on the path (a name of the paper's or a synset), or "unknown".
         size: pixels of a side of each view.
         views: per mesh.
         seed: of cameras, samples and split.

@@ -23,6 +23,7 @@ MAX_RADIUS = 0.51
 """A shape inside this radius is never cut by the frame: its half angle asin(r / 2) fits the field of view."""
 
 _AMBIENT, _DIFFUSE = 0.35, 0.6  # sum below 1: a white surface stays darker than the white background
+_DARKEST = 0.06  # a black surface still shows its shape
 _LIGHT_IN_CAM = np.array([-0.45, -0.7, -0.9]) / np.linalg.norm(
     [-0.45, -0.7, -0.9]
 )  # over the viewer's left shoulder
@@ -131,6 +132,7 @@ class Renderer:
         facing = np.einsum("nc,nc->n", normals, directions[hit])
         lengths = np.maximum(np.linalg.norm(normals, axis=-1), 1e-20)
         lambert = np.where(facing < 0, 1, -1) * (normals @ light.astype(np.float32)) / lengths
+        albedo = _DARKEST + (1 - _DARKEST) * albedo
         colours[hit] = albedo * (_AMBIENT + _DIFFUSE * np.maximum(lambert, 0))[:, None]
         return colours
 

@@ -58,7 +58,7 @@ class ShapeTree:
         categories: names or synsets to keep; all by default.
 
     Raises:
-        UserError: no data at `path`, no such split or category, or nothing in the split.
+        UserError: no data at `path`, or no such split or category.
     """
 
     def __init__(

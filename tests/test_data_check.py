@@ -1,0 +1,130 @@
+"""Cameras, depth maps and clouds agree, for both kinds of data, and the check sees when they do not."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from train.data import ShapeTree, store
+from train.data.check import agreement, check_tree
+from train.data.meshes import convert
+from train.data.procedural import generate
+from train.errors import UserError
+
+FURNITURE = Path("/usr/share/sweethome3d/furniture/KatorLegaz.sh3f")
+
+
+@pytest.fixture(scope="module")
+def procedural(tmp_path_factory):
+    out = tmp_path_factory.mktemp("check") / "data"
+    generate(out, shapes=6, categories=None, seed=0, size=112, views=4, processes=1)
+    return out
+
+
+def assert_agrees(report, shapes):
+    assert report.problems == []
+    assert len(report.agreements) == shapes
+    assert report.inside >= 0.99
+    for each in report.agreements:
+        assert each.inside >= 0.99, each
+        assert each.residual < 0.01, each
+    assert "no problems" in report.summary()
+
+
+def test_procedural_data_agree(procedural):
+    assert_agrees(check_tree(procedural), 6)
+
+
+def test_mesh_data_agree(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    trimesh.creation.torus(1.0, 0.3).export(folder / "torus.obj")
+    trimesh.creation.annulus(0.6, 1.0, 1.5).export(folder / "ring.glb")
+    trimesh.creation.capsule(2.0, 0.4).export(folder / "capsule.ply")
+    table = [trimesh.creation.box((2, 0.1, 1))]
+    for x, z in ((-0.9, -0.4), (0.9, -0.4), (-0.9, 0.4), (0.9, 0.4)):
+        pose = trimesh.transformations.translation_matrix((x, -0.6, z))
+        table.append(trimesh.creation.box((0.08, 1.2, 0.08), transform=pose))
+    trimesh.util.concatenate(table).export(folder / "table.off")
+    convert([folder], tmp_path / "out", labels=None, size=112, views=4, processes=1)
+    assert_agrees(check_tree(tmp_path / "out"), 4)
+
+
+def test_real_furniture_agrees(tmp_path):
+    if not FURNITURE.is_file():
+        pytest.skip("the Debian package sweethome3d-furniture is not installed")
+    labels = tmp_path / "labels.csv"
+    shipped = Path(__file__).parents[1] / "train" / "data" / "furniture_labels.csv"
+    lines = shipped.read_text().splitlines()
+    of_library = [line for line in lines if line.startswith(FURNITURE.name)]
+    labels.write_text("\n".join([lines[0], *of_library[::5]]) + "\n")
+    report = convert([FURNITURE], tmp_path / "out", labels=labels, size=112, views=3, processes=1)
+    assert report.failures == {}
+    assert_agrees(check_tree(tmp_path / "out"), report.made)
+
+
+def shape_with(shape, **changes):
+    return dataclasses.replace(shape, **changes)
+
+
+def test_each_way_to_disagree_is_seen(procedural):
+    tree = ShapeTree(procedural)
+    # A deep body, so that no half turn maps the shape to itself.
+    shape = next(each for each in tree.iter_valid() if each.id.endswith(("_h1", "_h2")))
+    assert agreement(shape).holds
+    flip = torch.diag(torch.tensor([1.0, 1, -1]))
+    turn = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    pushed = shape.camera.cam_from_world.clone()
+    pushed[:, 2, 3] += 0.02
+    wrong = {
+        "mirrored cloud": shape_with(shape, points=shape.points @ flip),
+        "z-up cloud": shape_with(shape, points=shape.points @ turn.T),
+        "larger cloud": shape_with(shape, points=shape.points * 1.1),
+        "views in another order": shape_with(shape, depth=shape.depth.roll(1, 0)),
+        "depth as ray length": shape_with(shape, depth=shape.depth * 1.02),
+        "camera further off": shape_with(
+            shape, camera=dataclasses.replace(shape.camera, cam_from_world=pushed)
+        ),
+        "pixels off by three": shape_with(shape, depth=shape.depth.roll(3, -1)),
+    }
+    for name, each in wrong.items():
+        assert not agreement(each).holds, name
+
+
+def test_problems_are_named(procedural, tmp_path):
+    root = tmp_path / "data"
+    shutil.copytree(procedural, root)
+    ids = [shape for split in store.SPLITS for shape in ShapeTree(root, split).ids]
+    broken, moved, unlisted, absent, doubled = ids[:5]
+    (store.render_folder(root, broken) / "depth_2.png").write_bytes(b"no")
+    camera = store.render_folder(root, moved) / "camera_0.json"
+    record = json.loads(camera.read_text())
+    record["cam_from_world"] = (np.diag([-1.0, -1, 1, 1]) @ np.array(record["cam_from_world"])).tolist()
+    camera.write_text(json.dumps(record))
+    store.cloud_file(root, absent).unlink()
+    for split in store.SPLITS:
+        for path in (root / store.LISTS / split).glob("*.list"):
+            lines = [line for line in path.read_text().split() if line != unlisted]
+            lines += [doubled] if doubled in lines else []
+            path.write_text("".join(f"{line}\n" for line in lines))
+    report = check_tree(root)
+    for shape, what in (
+        (broken, "depth_2.png cannot be read"),
+        (moved, "do not agree"),
+        (unlisted, "in no list"),
+        (absent, "no file"),
+        (doubled, "listed 2 times"),
+    ):
+        assert [p for p in report.problems if p.startswith(shape) and what in p], (what, report.problems)
+    assert len(report.problems) == 5
+    assert "5 problems" in report.summary()
+
+
+def test_no_data(tmp_path):
+    with pytest.raises(UserError, match="no data"):
+        check_tree(tmp_path)
