@@ -127,11 +127,10 @@ def test_materials_and_textures_of_an_archive_reach_the_picture(tmp_path):
 
 
 def test_vertex_and_face_colours(tmp_path):
-    mesh = trimesh.creation.box()
-    mesh.visual.face_colors = np.tile([255, 0, 0, 255], (12, 1))
-    mesh.export(tmp_path / "faces.ply")
-    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.tile([0, 0, 255, 255], (8, 1)))
-    mesh.export(tmp_path / "vertices.ply")
+    box = trimesh.creation.box()
+    red, blue = (np.tile((*rgb, 255), (count, 1)) for rgb, count in (((255, 0, 0), 12), ((0, 0, 255), 8)))
+    trimesh.Trimesh(box.vertices, box.faces, face_colors=red).export(tmp_path / "faces.ply")
+    trimesh.Trimesh(box.vertices, box.faces, vertex_colors=blue).export(tmp_path / "vertices.ply")
     for name, colour in (("faces", (1, 0, 0)), ("vertices", (0, 0, 1))):
         corners = load_surface(tmp_path / f"{name}.ply").corner_colours
         np.testing.assert_allclose(corners.reshape(-1, 3), np.tile(colour, (36, 1)), atol=0.01)
@@ -185,6 +184,18 @@ def test_labels_that_fit_nothing_or_are_none(tmp_path):
         with pytest.raises(UserError, match=message):
             convert([tmp_path / "lib"], tmp_path / "out", labels=labels, **SMALL)
     assert not (tmp_path / "out").exists()
+
+
+def test_what_is_no_model_is_not_even_a_failure(tmp_path):
+    for name in (
+        "real.obj",
+        "__MACOSX/real.obj",
+        "._real.obj",
+        "out/pcdata_2048/unknown/real.ply",
+        ".git/x.obj",
+    ):
+        save_box(tmp_path / name)
+    assert [mesh.inside for mesh in find_meshes([tmp_path], tmp_path / "none")[0]] == ["real.obj"]
 
 
 def test_a_shapenet_tree_keeps_its_names(tmp_path):

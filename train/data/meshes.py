@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from PIL import Image
+from trimesh.visual import ColorVisuals, TextureVisuals
 
 from train.data import store
 from train.data.categories import category_of
-from train.data.render import Renderer, draw_camera
+from train.data.render import Renderer, draw_camera, load_embree
 from train.data.sources import MeshFile, find_meshes, keep_labelled, read_labels, shape_ids
 from train.data.surface import Surface, sample_triangles
 from train.data.work import run_all
@@ -90,6 +91,7 @@ def convert(
     for name, value, low, high in (("size", size, 16, 2048), ("views", views, 1, 256)):
         if not low <= value <= high:
             raise UserError(f"{name} must be between {low} and {high}; got {value}")
+    load_embree()
     wanted = read_labels(labels) if labels is not None else None
     with tempfile.TemporaryDirectory(prefix="meshes-") as scratch:
         meshes, failures = find_meshes([Path(source) for source in sources], Path(scratch))
@@ -171,8 +173,10 @@ def _convert_one(job: _Job) -> int | Exception:
         views = Renderer(surface).render(draw_camera(cameras, job.views, job.size))
         points, _ = sample_triangles(surface.vertices[surface.faces], store.POINTS, samples)
         store.write_shape(job.out, job.shape, views, points)
-    except (MeshError, MemoryError, OSError) as error:
+    except (MeshError, UserError) as error:
         return error
+    except Exception as error:  # whatever is wrong with one mesh, the others must be made
+        return MeshError(f"{type(error).__name__}: {error}")
     return 1
 
 
@@ -195,7 +199,7 @@ def _coloured(mesh: trimesh.Trimesh, vertices: np.ndarray, faces: np.ndarray) ->
     """Texture if there is one, else vertex or face colours, else the material's colour."""
     visual = mesh.visual
     colours = np.full((len(faces), 3), 0.7)
-    if isinstance(visual, trimesh.visual.TextureVisuals):
+    if isinstance(visual, TextureVisuals):
         material = visual.material
         image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
         uv = visual.uv
@@ -209,11 +213,11 @@ def _coloured(mesh: trimesh.Trimesh, vertices: np.ndarray, faces: np.ndarray) ->
                 (_texture(image),),
             )
         colours[:] = np.asarray(material.main_color[:3]) / 255
-    elif visual.kind == "vertex":
+    elif isinstance(visual, ColorVisuals) and visual.kind == "vertex":
         surface = Surface.plain(vertices, faces, colours)
         corner_colours = np.asarray(visual.vertex_colors)[faces, :3].astype(np.float32) / 255
         return dataclasses.replace(surface, corner_colours=corner_colours)
-    elif visual.kind == "face":
+    elif isinstance(visual, ColorVisuals) and visual.kind == "face":
         colours = np.asarray(visual.face_colors)[:, :3] / 255
     return Surface.plain(vertices, faces, colours)
 

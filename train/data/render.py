@@ -60,7 +60,7 @@ class Renderer:
     """Casts rays at one surface; building it builds embree's tree once for all views."""
 
     def __init__(self, surface: Surface) -> None:
-        rtcore_scene, mesh_construction = _embree()
+        rtcore_scene, mesh_construction = load_embree()
         self.surface = surface
         self._scene = rtcore_scene.EmbreeScene()
         mesh_construction.TriangleMesh(
@@ -146,7 +146,12 @@ def _sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return texture[row, column].astype(np.float32) / 255
 
 
-def _embree() -> tuple[Any, Any]:
+def load_embree() -> tuple[Any, Any]:
+    """embree's scene and mesh modules.
+
+    Raises:
+        UserError: embreex is not installed or does not run here.
+    """
     try:
         return import_module("embreex.rtcore_scene"), import_module("embreex.mesh_construction")
     except ImportError as error:

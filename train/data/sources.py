@@ -14,11 +14,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 from train.data.categories import CATEGORY_OF, SYNSET_OF, UNKNOWN, synset_of
+from train.data.store import CLOUDS
 from train.errors import UserError
 
 MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".off", ".stl")
 ARCHIVE_SUFFIXES = (".zip", ".sh3f")
 _NO_NAMES = {"model", "models", "model_normalized", "mesh", "meshes", "object"}
+_NOT_A_MODEL = re.compile(rf"(^|/)(\.|__MACOSX/|{CLOUDS}/)")
+"""Hidden files, the shadow files of macOS archives, and the clouds of a dataset made below the source."""
+
 _CATALOGUE = "PluginFurnitureCatalog.properties"
 
 Rotation = tuple[float, ...]
@@ -94,8 +98,8 @@ def find_meshes(sources: Sequence[Path], scratch: Path) -> tuple[list[MeshFile],
 def _in_folder(folder: Path, library: str, rotations: dict[str, Rotation] | None = None) -> list[MeshFile]:
     found = []
     for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in MESH_SUFFIXES and path.is_file():
-            inside = path.relative_to(folder).as_posix()
+        inside = path.relative_to(folder).as_posix()
+        if path.suffix.lower() in MESH_SUFFIXES and path.is_file() and not _NOT_A_MODEL.search(inside):
             synset = _synset_from((library, *PurePosixPath(inside).parts[:-1]))
             found.append(MeshFile(path, library, inside, synset, (rotations or {}).get(inside)))
     return found

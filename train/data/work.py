@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.context import SpawnContext
 from typing import Any, TypeVar
 
 from tqdm import tqdm
@@ -38,26 +39,29 @@ def run_all(
 def _in_pool(
     function: Callable[[Job], Any], jobs: Sequence[Job], processes: int
 ) -> Iterator[tuple[Job, Any]]:
-    """A crash breaks the whole pool of processes: the jobs left over then run one at a time, each in its own."""
+    """A crash breaks the whole pool of processes: those it worked on then run alone, the rest in a new pool."""
     # Not forked: a child of a process with torch's or Taichi's threads can hang.
     context = multiprocessing.get_context("spawn")
     left = dict.fromkeys(range(len(jobs)))
-    with ProcessPoolExecutor(processes, mp_context=context) as pool:
-        futures = {pool.submit(function, job): number for number, job in enumerate(jobs)}
+    while left:
+        pool = ProcessPoolExecutor(min(processes, len(left)), mp_context=context)
+        futures = {pool.submit(function, jobs[number]): number for number in left}
         try:
             for future in as_completed(futures):
                 result = future.result()
                 del left[futures[future]]
                 yield jobs[futures[future]], result
-            return
         except BrokenProcessPool:
-            pass
-        except BaseException:
+            for number in list(left)[:processes]:  # jobs start in order: it worked on the first ones not done
+                del left[number]
+                yield jobs[number], _alone(function, jobs[number], context)
+        finally:
             pool.shutdown(cancel_futures=True)
-            raise
-    for number in left:
-        with ProcessPoolExecutor(1, mp_context=context) as pool:
-            try:
-                yield jobs[number], pool.submit(function, jobs[number]).result()
-            except BrokenProcessPool:
-                yield jobs[number], OSError("the process that worked on it crashed or ran out of memory")
+
+
+def _alone(function: Callable[[Job], Any], job: Job, context: SpawnContext) -> Any:
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        try:
+            return pool.submit(function, job).result()
+        except BrokenProcessPool:
+            return OSError("the process that worked on it crashed or ran out of memory")
