@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -22,7 +23,7 @@ from tqdm import tqdm
 
 from diffpoint import PinholeCamera
 
-from .data import Shape, ShapeTree
+from .data import ShapeTree
 from .errors import UserError
 
 
@@ -171,8 +172,8 @@ def load_split(
         tree.iter_valid(), f"reading {split}", len(tree), leave=False, unit="shape", disable=not progress
     )
     for shape in bar:
-        if reason := _unusable(shape, rows[0].shape if rows else shape):
-            tree.skipped[shape.id] = reason
+        if (~shape.depth.isfinite()).flatten(1).all(1).any():
+            tree.skipped[shape.id] = f"{shape.id}: one of its views shows nothing"
             continue
         if shape.depth.shape[-1] % map_size:
             raise UserError(
@@ -180,7 +181,10 @@ def load_split(
                 f"{map_size}; render at another size or set --map-size"
             )
         small = _POOLS[gt_pool](shape.depth, shape.camera, size=map_size)
-        rows.append(_Row(_bytes_at(shape.images, image_size), small.depth, small.camera, shape))
+        size = (*shape.depth.shape, len(shape.points))
+        images = _bytes_at(shape.images, image_size)
+        rows.append(_Row(shape.id, shape.category, size, images, small.depth, small.camera, shape.points))
+    rows = _of_the_usual_size(rows, tree.skipped)
     for reason in tree.skipped.values():
         tqdm.write(f"left out: {reason}", file=sys.stderr)
     if not rows:
@@ -192,17 +196,22 @@ def load_split(
         depth=torch.stack([row.depth for row in rows]),
         K=torch.stack([row.camera.K for row in rows]),
         cam_from_world=torch.stack([row.camera.cam_from_world for row in rows]),
-        points=torch.stack([row.shape.points for row in rows]),
-        ids=[row.shape.id for row in rows],
-        categories=[row.shape.category for row in rows],
+        points=torch.stack([row.points for row in rows]),
+        ids=[row.id for row in rows],
+        categories=[row.category for row in rows],
     )
 
 
 class _Row(NamedTuple):
+    """What is kept of one shape; `size` is that of the files: views, height, width, points."""
+
+    id: str
+    category: str
+    size: tuple[int, ...]
     images: Tensor
     depth: Tensor
     camera: PinholeCamera
-    shape: Shape
+    points: Tensor
 
 
 def _bytes_at(images: Tensor, size: tuple[int, int]) -> Tensor:
@@ -210,14 +219,17 @@ def _bytes_at(images: Tensor, size: tuple[int, int]) -> Tensor:
     return (resized.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
-def _unusable(shape: Shape, first: Shape) -> str | None:
-    """Why a shape cannot be stacked with the first one and trained on, or None."""
-    for name, count in (("depth", "views and pixels"), ("points", "points")):
-        want, got = tuple(getattr(first, name).shape), tuple(getattr(shape, name).shape)
-        if want != got:
-            return f"{shape.id}: {count} {got} differ from {want} of {first.id}"
-    empty = ~shape.depth.isfinite().flatten(1).any(1)
-    return f"{shape.id}: view {int(empty.int().argmax())} shows nothing" if empty.any() else None
+def _of_the_usual_size(rows: list[_Row], skipped: dict[str, str]) -> list[_Row]:
+    """Keeps the shapes with the most common numbers of views, pixels and points; names the others in
+    `skipped`."""
+
+    if not rows:
+        return rows
+    usual = Counter(row.size for row in rows).most_common(1)[0][0]
+    for row in rows:
+        if row.size != usual:
+            skipped[row.id] = f"{row.id}: (views, height, width, points) are {row.size}, elsewhere {usual}"
+    return [row for row in rows if row.size == usual]
 
 
 class Sampler:

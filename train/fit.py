@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -65,6 +64,7 @@ def training_step(
         group["lr"] = stage.learning_rate_at(step)
 
     clouds = model(batch.images.flatten(0, 1), codes)  # (R, B*V, N, 3): the trunk sees each image once
+    _check_finite(clouds, step)
 
     # Every cloud before its own image's camera, or a shape's clouds joined and before each of its cameras.
     scene = arrange_scenes(clouds, batch.camera, batch.depth, joined_views=stage.joined_views)
@@ -187,7 +187,6 @@ def _run_stage(
                 record |= training.validate_and_keep_best(val, out)
             if record or training.step % config.log_every == 0:
                 values = {name: value.item() for name, value in report._asdict().items()}
-                _check_finite(values["loss"], training.total_steps)
                 record = {"stage": number, **values, **clock.read(), **record}
                 record["diversity_weight"] = stage.diversity_weight(training.step - 1)
                 record["learning_rate"] = stage.learning_rate_at(training.step - 1)
@@ -232,9 +231,11 @@ def _bar_values(record: dict[str, Any]) -> dict[str, str]:
     return shown | {"wait": f"{record['data_wait_share']:.0%}"}
 
 
-def _check_finite(loss: float, step: int) -> None:
-    if not math.isfinite(loss):
-        raise UserError(f"stopped at step {step}: the loss is {loss}; lower the learning rate")
+def _check_finite(clouds: Tensor, step: int) -> None:
+    if not clouds.detach().isfinite().all():
+        raise UserError(
+            f"stopped at step {step} of the stage: predictions are no longer finite; lower the learning rate"
+        )
 
 
 def _health_images(val: LoadedSplit) -> Tensor:

@@ -1,0 +1,32 @@
+"""Data and a trained run that several test files share; each is made once per session."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads would slow the kernels
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tree of 12 chairs and displays, 4 views of 64 x 64 pixels each."""
+    from train.data.procedural import generate
+
+    root = tmp_path_factory.mktemp("data") / "tiny"
+    generate(root, shapes=12, categories=["chair", "display"], seed=0, size=64, views=4, processes=1)
+    return root
+
+
+@pytest.fixture(scope="session")
+def smoke_run(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the smoke profile on the tiny tree: 30 steps of stage 1, 20 of stage 2."""
+    from train.config import PROFILES
+    from train.fit import fit
+
+    run = tmp_path_factory.mktemp("runs") / "smoke"
+    assert fit(tiny_data, run, PROFILES["smoke"], progress=False)
+    return run

@@ -1,0 +1,87 @@
+"""Weights on disk: the way there and back, and everything that is no run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from models import build_generator
+from train.checkpoint import load_checkpoint, load_generator, save_checkpoint, save_weights
+from train.errors import UserError
+from train.files import replacing
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_weights_come_back_with_the_network_they_belong_to(deterministic: bool, tmp_path: Path) -> None:
+    model = build_generator("smoke", deterministic)
+    save_weights(model, tmp_path / "w.safetensors")
+    back = load_generator(tmp_path / "w.safetensors")
+    assert back.config == model.config
+    assert not back.training
+    images, codes = torch.rand(2, 3, 40, 40), torch.randn(3, 2, model.code_dim)
+    assert torch.equal(back(images, codes), model(images, codes))
+
+
+def test_a_run_gives_its_best_weights_and_only_then_the_newest(tmp_path: Path) -> None:
+    models = [build_generator("smoke") for _ in range(3)]
+    save_checkpoint(tmp_path, 7, models[0], {})
+    for expected, name in zip(models, (None, "best-stage1", "best-stage2"), strict=True):
+        if name:
+            save_weights(expected, tmp_path / "checkpoints" / f"{name}.safetensors")
+        found = load_generator(tmp_path).state_dict()
+        assert all(torch.equal(value, found[key]) for key, value in expected.state_dict().items())
+
+
+def test_the_newest_two_checkpoints_are_kept(tmp_path: Path) -> None:
+    model = build_generator("smoke")
+    for step in (1, 2, 3, 3):
+        save_checkpoint(tmp_path, step, model, {"step": step})
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["step-00000002", "step-00000003"]
+    assert load_checkpoint(tmp_path / "checkpoints" / "step-00000003", model) == {"step": 3}
+
+
+def test_what_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "noise.safetensors").write_bytes(b"\x00" * 100)
+    save_file({"a": torch.zeros(1)}, tmp_path / "other.safetensors")
+    (tmp_path / "empty").mkdir()
+    for name, complaint in (
+        ("missing", "does not exist"),
+        ("empty", "is not a run"),
+        ("noise.safetensors", "holds no generator's weights"),
+        ("other.safetensors", "no diffpoint header"),
+    ):
+        with pytest.raises(UserError, match=complaint) as caught:
+            load_generator(tmp_path / name)
+        assert name in str(caught.value)
+
+
+def test_an_unreadable_state_is_named(tmp_path: Path) -> None:
+    model = build_generator("smoke")
+    save_checkpoint(tmp_path, 5, model, {})
+    directory = tmp_path / "checkpoints" / "step-00000005"
+    (directory / "state.pt").write_bytes(b"half a fi")
+    with pytest.raises(UserError, match=r"state\.pt cannot be read"):
+        load_checkpoint(directory, model)
+
+
+@pytest.mark.parametrize("kind", ["file", "directory"])
+def test_a_failed_write_leaves_no_trace(kind: str, tmp_path: Path) -> None:
+    if kind == "file":
+        (tmp_path / "target").write_text("old")
+
+    def write() -> None:
+        with replacing(tmp_path / "target") as temporary:
+            if kind == "file":
+                temporary.write_text("half")
+            else:
+                temporary.mkdir()
+                (temporary / "part").write_text("half")
+            raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        write()
+    assert [p.name for p in tmp_path.iterdir()] == (["target"] if kind == "file" else [])
+    assert kind == "directory" or (tmp_path / "target").read_text() == "old"
