@@ -75,6 +75,7 @@ class _Runtime:
                 log_level=ti.ERROR,
                 cpu_max_num_threads=self.threads or available_threads(),
                 offline_cache=self.cache,
+                fast_math=False,  # it assumes that there is no infinity, and infinity marks empty pixels
                 # Even two iterations of a parallel loop are shared out among the threads.
                 make_cpu_multithreading_loop=False,
                 default_cpu_block_dim=1,

@@ -91,17 +91,20 @@ def _splat(
     _checks.check_lengths_range("splat_depth", "lengths", lengths, points.shape[1])
     _checks.check_finite("splat_depth", "points", points, lengths)
     batch, views = projection.shape[:2]
-    depth = points.new_full((batch * views, height, width), torch.inf)
-    index = torch.full((batch * views, height, width), -1, dtype=torch.int64)
-    visible = torch.zeros((batch * views, points.shape[1]), dtype=torch.uint8)
-    if points.numel() and depth.numel():
-        cameras = projection.reshape(batch * views, 12)
-        kernel, extra = ("forward", ()) if radius == 0 else ("forward_disc", (radius,))
-        _bridge.launch(
-            "splat", kernel, points.dtype, points, lengths, cameras, depth, index, visible, views, *extra
-        )
+    count = points.shape[1]
     shape = (batch, views, height, width)
-    return depth.view(shape), index.view(shape), visible.view(torch.bool).view(batch, views, -1)
+    if count == 0 or batch * views == 0:
+        empty = points.new_full(shape, torch.inf), torch.full(shape, -1, dtype=torch.int64)
+        return *empty, torch.zeros((batch, views, count), dtype=torch.bool)
+    depth = points.new_empty(shape)
+    index = torch.empty(shape, dtype=torch.int64)
+    visible = torch.empty((batch, views, count), dtype=torch.uint8)
+    outputs = depth.view(-1), index.view(-1), visible.view(-1)
+    kernel, extra = ("forward", ()) if radius == 0 else ("forward_disc", (radius,))
+    sizes = views, count, height, width
+    inputs = points.reshape(-1), lengths, projection.reshape(-1)
+    _bridge.launch("splat", kernel, points.dtype, *inputs, *outputs, *sizes, *extra)
+    return depth, index, visible.view(torch.bool)
 
 
 @_bridge.register(
@@ -114,22 +117,22 @@ def _splat(
 def _splat_backward(
     points: Tensor, projection: Tensor, index: Tensor, grad_depth: Tensor
 ) -> tuple[Tensor, Tensor]:
-    batch, views, height, width = index.shape
+    _, views, height, width = index.shape
     grad_points = points.new_zeros(points.shape)
-    grad_projection = projection.new_zeros((batch * views, 12))
+    grad_projection = projection.new_zeros(projection.shape)
     if points.numel() and index.numel():
-        maps = (batch * views, height, width)
-        cameras = projection.reshape(batch * views, 12)
         _bridge.launch(
             "splat",
             "backward",
             points.dtype,
-            points,
-            cameras,
-            index.view(maps),
-            grad_depth.reshape(maps),
-            grad_points,
-            grad_projection,
+            points.reshape(-1),
+            projection.reshape(-1),
+            index.view(-1),
+            grad_depth.reshape(-1),
+            grad_points.view(-1),
+            grad_projection.view(-1),
             views,
+            points.shape[1],
+            height * width,
         )
-    return grad_points, grad_projection.view(batch, views, 3, 4)
+    return grad_points, grad_projection

@@ -6,146 +6,155 @@ from diffpoint.kernels._backend import ti
 
 
 def build(real):
-    points3 = ti.types.ndarray(dtype=real, ndim=3)
-    cameras2 = ti.types.ndarray(dtype=real, ndim=2)
-    maps3 = ti.types.ndarray(dtype=real, ndim=3)
-    index3 = ti.types.ndarray(dtype=ti.i64, ndim=3)
-    index2 = ti.types.ndarray(dtype=ti.i64, ndim=2)
+    # Flat arrays and the camera in registers: indexing in three dimensions would cost more than the arithmetic.
+    reals = ti.types.ndarray(dtype=real, ndim=1)
     integers = ti.types.ndarray(dtype=ti.i64, ndim=1)
+    flags = ti.types.ndarray(dtype=ti.u8, ndim=1)
+    points3 = ti.types.ndarray(dtype=real, ndim=3)
+    index2 = ti.types.ndarray(dtype=ti.i64, ndim=2)
     flags2 = ti.types.ndarray(dtype=ti.u8, ndim=2)
 
     @ti.func
-    def image_position(points: ti.template(), camera: ti.template(), cloud: ti.i32, view: ti.i32, i: ti.i32):
-        x = points[cloud, i, 0]
-        y = points[cloud, i, 1]
-        z = points[cloud, i, 2]
-        d = camera[view, 8] * x + camera[view, 9] * y + camera[view, 10] * z + camera[view, 11]
-        u = (camera[view, 0] * x + camera[view, 1] * y + camera[view, 2] * z + camera[view, 3]) / d
-        v = (camera[view, 4] * x + camera[view, 5] * y + camera[view, 6] * z + camera[view, 7]) / d
+    def clear(depth: ti.template(), index: ti.template(), visible: ti.template(), view, pixels, count):
+        for p in range(view * pixels, view * pixels + pixels):
+            depth[p] = real(ti.math.inf)
+        for p in range(view * pixels, view * pixels + pixels):
+            index[p] = -1
+        for i in range(view * count, view * count + count):
+            visible[i] = ti.u8(0)
+
+    @ti.func
+    def mark_winners(index: ti.template(), visible: ti.template(), view, pixels, count):
+        for p in range(view * pixels, view * pixels + pixels):
+            i = ti.cast(index[p], ti.i32)
+            if i >= 0:
+                visible[view * count + i] = ti.u8(1)
+
+    @ti.func
+    def image_position(points: ti.template(), camera: ti.template(), offset):
+        x = points[offset]
+        y = points[offset + 1]
+        z = points[offset + 2]
+        d = camera[8] * x + camera[9] * y + camera[10] * z + camera[11]
+        u = (camera[0] * x + camera[1] * y + camera[2] * z + camera[3]) / d
+        v = (camera[4] * x + camera[5] * y + camera[6] * z + camera[7]) / d
         return u, v, d
 
     @ti.kernel
     def forward(
-        points: points3,
+        points: reals,
         lengths: integers,
-        projection: cameras2,
-        depth: maps3,
-        index: index3,
-        visible: flags2,
+        projection: reals,
+        depth: reals,
+        index: integers,
+        visible: flags,
         views: ti.i32,
+        count: ti.i32,
+        height: ti.i32,
+        width: ti.i32,
         spread: ti.i32,
     ):
         """One pixel per point. One thread owns one map; the nearest depth wins, then the lowest index."""
-        height = depth.shape[1]
-        width = depth.shape[2]
-        for step in range(depth.shape[0] * spread):
+        pixels = height * width
+        for step in range(lengths.shape[0] * views * spread):
             if step % spread == 0:
                 view = step // spread
                 cloud = view // views
-                for row in range(height):
-                    for column in range(width):
-                        depth[view, row, column] = real(ti.math.inf)
-                for row in range(height):
-                    for column in range(width):
-                        index[view, row, column] = -1
-                for i in range(points.shape[1]):
-                    visible[view, i] = ti.u8(0)
+                clear(depth, index, visible, view, pixels, count)
+                camera = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
+                columns = ti.cast(width, real)
+                rows = ti.cast(height, real)
                 for i in range(ti.cast(lengths[cloud], ti.i32)):
-                    u, v, d = image_position(points, projection, cloud, view, i)
-                    if d > 0 and u >= 0 and u < width and v >= 0 and v < height:
-                        column = ti.cast(u, ti.i32)
-                        row = ti.cast(v, ti.i32)
-                        if d < depth[view, row, column]:
-                            loser = ti.cast(index[view, row, column], ti.i32)
-                            if loser >= 0:
-                                visible[view, loser] = ti.u8(0)
-                            depth[view, row, column] = d
-                            index[view, row, column] = i
-                            visible[view, i] = ti.u8(1)
+                    u, v, d = image_position(points, camera, (cloud * count + i) * 3)
+                    # Bitwise "and", and a select for the winner: both choices are cheaper than a missed branch.
+                    if (d > 0) & (u >= 0) & (u < columns) & (v >= 0) & (v < rows):
+                        p = view * pixels + ti.cast(v, ti.i32) * width + ti.cast(u, ti.i32)
+                        wins = d < depth[p]
+                        depth[p] = ti.select(wins, d, depth[p])
+                        index[p] = ti.select(wins, ti.cast(i, ti.i64), index[p])
+                mark_winners(index, visible, view, pixels, count)
 
     @ti.kernel
     def forward_disc(
-        points: points3,
+        points: reals,
         lengths: integers,
-        projection: cameras2,
-        depth: maps3,
-        index: index3,
-        visible: flags2,
+        projection: reals,
+        depth: reals,
+        index: integers,
+        visible: flags,
         views: ti.i32,
+        count: ti.i32,
+        height: ti.i32,
+        width: ti.i32,
         radius: real,
         spread: ti.i32,
     ):
         """Each point covers its own pixel and those whose centre lies within `radius` pixels of it."""
-        height = depth.shape[1]
-        width = depth.shape[2]
-        for step in range(depth.shape[0] * spread):
+        pixels = height * width
+        for step in range(lengths.shape[0] * views * spread):
             if step % spread == 0:
                 view = step // spread
                 cloud = view // views
-                for row in range(height):
-                    for column in range(width):
-                        depth[view, row, column] = real(ti.math.inf)
-                        index[view, row, column] = -1
-                for i in range(points.shape[1]):
-                    visible[view, i] = ti.u8(0)
+                clear(depth, index, visible, view, pixels, count)
+                camera = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
+                margin = radius + real(1.0)
+                half = real(0.5)
                 for i in range(ti.cast(lengths[cloud], ti.i32)):
-                    u, v, d = image_position(points, projection, cloud, view, i)
-                    margin = radius + real(1.0)
-                    if d > 0 and u > -margin and u < width + margin and v > -margin and v < height + margin:
+                    u, v, d = image_position(points, camera, (cloud * count + i) * 3)
+                    if (d > 0) & (u > -margin) & (u < width + margin) & (v > -margin) & (v < height + margin):
                         own_column = ti.cast(ti.floor(u), ti.i32)
                         own_row = ti.cast(ti.floor(v), ti.i32)
-                        first_row = ti.max(
-                            ti.min(ti.cast(ti.ceil(v - radius - real(0.5)), ti.i32), own_row), 0
+                        top = ti.max(ti.min(ti.cast(ti.ceil(v - radius - half), ti.i32), own_row), 0)
+                        bottom = ti.min(
+                            ti.max(ti.cast(ti.floor(v + radius - half), ti.i32), own_row), height - 1
                         )
-                        last_row = ti.min(
-                            ti.max(ti.cast(ti.floor(v + radius - real(0.5)), ti.i32), own_row), height - 1
+                        left = ti.max(ti.min(ti.cast(ti.ceil(u - radius - half), ti.i32), own_column), 0)
+                        right = ti.min(
+                            ti.max(ti.cast(ti.floor(u + radius - half), ti.i32), own_column), width - 1
                         )
-                        first_column = ti.max(
-                            ti.min(ti.cast(ti.ceil(u - radius - real(0.5)), ti.i32), own_column), 0
-                        )
-                        last_column = ti.min(
-                            ti.max(ti.cast(ti.floor(u + radius - real(0.5)), ti.i32), own_column), width - 1
-                        )
-                        for row in range(first_row, last_row + 1):
-                            for column in range(first_column, last_column + 1):
-                                du = ti.cast(column, real) + real(0.5) - u
-                                dv = ti.cast(row, real) + real(0.5) - v
+                        for row in range(top, bottom + 1):
+                            for column in range(left, right + 1):
+                                p = view * pixels + row * width + column
+                                du = ti.cast(column, real) + half - u
+                                dv = ti.cast(row, real) + half - v
                                 covered = du * du + dv * dv <= radius * radius
-                                own = row == own_row and column == own_column
-                                if (covered or own) and d < depth[view, row, column]:
-                                    depth[view, row, column] = d
-                                    index[view, row, column] = i
-                for row in range(height):
-                    for column in range(width):
-                        i = ti.cast(index[view, row, column], ti.i32)
-                        if i >= 0:
-                            visible[view, i] = ti.u8(1)
+                                own = (row == own_row) & (column == own_column)
+                                wins = (covered | own) & (d < depth[p])
+                                depth[p] = ti.select(wins, d, depth[p])
+                                index[p] = ti.select(wins, ti.cast(i, ti.i64), index[p])
+                mark_winners(index, visible, view, pixels, count)
 
     @ti.kernel
     def backward(
-        points: points3,
-        projection: cameras2,
-        index: index3,
-        grad_depth: maps3,
-        grad_points: points3,
-        grad_projection: cameras2,
+        points: reals,
+        projection: reals,
+        index: integers,
+        grad_depth: reals,
+        grad_points: reals,
+        grad_projection: reals,
         views: ti.i32,
+        count: ti.i32,
+        pixels: ti.i32,
         spread: ti.i32,
     ):
         """depth = projection[2] @ (point, 1). One thread owns one cloud and all its views."""
-        for step in range(points.shape[0] * spread):
+        for step in range(points.shape[0] // (3 * count) * spread):
             if step % spread == 0:
                 cloud = step // spread
                 for view in range(cloud * views, cloud * views + views):
-                    for row in range(index.shape[1]):
-                        for column in range(index.shape[2]):
-                            i = ti.cast(index[view, row, column], ti.i32)
-                            if i >= 0:
-                                g = grad_depth[view, row, column]
-                                for k in ti.static(range(3)):
-                                    grad_points[cloud, i, k] += g * projection[view, 8 + k]
-                                    grad_projection[view, 8 + k] += g * points[cloud, i, k]
-                                grad_projection[view, 11] += g
+                    row = ti.Vector([projection[view * 12 + 8 + k] for k in ti.static(range(3))])
+                    total = ti.Vector([real(0.0) for k in ti.static(range(4))])
+                    for p in range(view * pixels, view * pixels + pixels):
+                        i = ti.cast(index[p], ti.i32)
+                        if i >= 0:
+                            g = grad_depth[p]
+                            offset = (cloud * count + i) * 3
+                            for k in ti.static(range(3)):
+                                grad_points[offset + k] += g * row[k]
+                                total[k] += g * points[offset + k]
+                            total[3] += g
+                    for k in ti.static(range(4)):
+                        grad_projection[view * 12 + 8 + k] = total[k]
 
     @ti.kernel
     def gather_visible(
