@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import imageio.v3 as imageio
 import numpy as np
 import torch
+from PIL import Image, ImageOps
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -41,15 +41,16 @@ def _read(path: Path) -> Tensor:
     if not path.is_file():
         raise UserError(f"{path} does not exist or is no file; name the images to reconstruct from")
     try:
-        pixels = imageio.imread(path)
+        with Image.open(path) as file:
+            image = ImageOps.exif_transpose(
+                file
+            )  # cameras note how they were held instead of turning the pixels
+            if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16", "F"):
+                image = image.convert("RGBA")
+            pixels = np.atleast_3d(np.asarray(image))
     except Exception as error:  # every decoder has its own exceptions; all mean that this is no image
         reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
         raise UserError(f"{path} is not an image that can be read ({reason})") from None
-    if pixels.ndim == 4:  # an animation: its first frame
-        pixels = pixels[0]
-    pixels = np.atleast_3d(pixels)
-    if pixels.ndim != 3 or pixels.shape[2] > 4 or 0 in pixels.shape:
-        raise UserError(f"{path} is not an image of 1 to 4 channels; it has shape {pixels.shape}")
     top = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1.0
     values = np.asarray(pixels, np.float32) / np.float32(top)
     if values.shape[2] in (2, 4):

@@ -1,0 +1,105 @@
+"""Evaluation: closed forms of the figures, the trivial answers, and what evaluation.json holds."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from train.batches import load_split
+from train.evaluate import evaluate
+from train.metrics import cloud_errors, thin_out
+from train.table import format_table
+from train.trivial import medoid, nearest_by_image
+
+
+def _lattice() -> torch.Tensor:
+    axis = torch.arange(5.0)
+    return torch.cartesian_prod(axis, axis, axis)
+
+
+def test_a_shifted_lattice_is_200_shifts_away() -> None:
+    lattice = _lattice()
+    errors = cloud_errors((lattice + torch.tensor([0.0, 0.06, 0.08]))[None], lattice[None])
+    assert errors.cd.item() == pytest.approx(200 * 0.1, rel=1e-4)
+    assert errors.gt_to_pred.item() == pytest.approx(errors.pred_to_gt.item(), rel=1e-4)
+
+
+def test_missing_parts_cost_in_one_direction_only() -> None:
+    lattice = _lattice()
+    errors = cloud_errors(lattice[None, :25], lattice[None])
+    assert errors.pred_to_gt.item() == 0
+    assert errors.gt_to_pred.item() == pytest.approx(100 * (1 + 2 + 3 + 4) / 5, rel=1e-4)
+
+
+def test_thinning_keeps_a_spread_out_subset_and_small_clouds_whole() -> None:
+    torch.manual_seed(0)
+    cloud = torch.rand(2, 400, 3)
+    thin = thin_out(cloud, 50)
+    assert thin.shape == (2, 50, 3)
+    reach = torch.cdist(cloud, thin).amin(2).amax(1)
+    assert (reach < torch.cdist(cloud, cloud[:, :50]).amin(2).amax(1)).all()
+    assert thin_out(cloud, 400) is cloud
+
+
+def test_the_medoid_is_the_cloud_in_the_middle() -> None:
+    torch.manual_seed(0)
+    base = torch.rand(512, 3)
+    shifts = torch.tensor([-0.5, -0.2, 0.0, 0.3, 0.9])
+    clouds = torch.stack([base + torch.tensor([shift, 0.0, 0.0]) for shift in shifts])
+    assert medoid(clouds) == 2
+
+
+def test_the_nearest_image_of_a_known_shape_is_its_own(tiny_data: Path) -> None:
+    split = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, progress=False)
+    found = nearest_by_image(split, split, views=(1, 4))
+    assert all(index.tolist() == list(range(len(split))) for index in found.values())
+    shuffled = dataclasses.replace(split, images=split.images.flip(0))
+    found = nearest_by_image(shuffled, split, views=(2,))
+    assert found[2].tolist() == list(reversed(range(len(split))))
+
+
+def test_evaluation_holds_what_the_design_promises(smoke_run: Path, tiny_data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "evaluation.json"
+    result = evaluate(smoke_run, tiny_data, seeds=(0, 1), out=out, progress=False)
+    assert json.loads(out.read_text()) == json.loads(json.dumps(result))
+    assert {
+        "profile",
+        "config",
+        "data",
+        "seeds",
+        "medoid",
+        "views",
+        "categories",
+        "sensitivity",
+    } <= result.keys()
+    assert result["seeds"] == [0, 1]
+    assert list(result["views"]) == ["1", "2", "4"]  # the data have four views
+    for n, row in result["views"].items():
+        assert set(row) == {"gt_to_pred", "pred_to_gt", "cd", "fps_cd", "consistency"}
+        assert row["cd"] == pytest.approx(row["gt_to_pred"] + row["pred_to_gt"], rel=1e-5)
+        assert (row["consistency"] is None) == (n == "1")
+        if n != "1":
+            assert row["consistency"] < result["random_codes"][n]["consistency"]
+    assert result["views"]["1"]["cd"] == result["views"]["1"]["fps_cd"]
+    assert set(result["medoid"]) == {"cd", "fps_cd"}
+    assert set(result["nearest_image"]) == {"1", "2", "4"}
+    assert min(result["sensitivity"].values()) > 0.5
+    shapes = {name: entry["shapes"] for name, entry in result["categories"].items()}
+    assert sum(shapes.values()) == result["data"]["shapes"] == 3
+    weighted = sum(entry["shapes"] * entry["views"]["4"]["cd"] for entry in result["categories"].values()) / 3
+    assert weighted == pytest.approx(result["views"]["4"]["cd"], rel=1e-5)
+    table = format_table(result)
+    assert f"{result['views']['4']['cd']:.2f}" in table
+    assert "medoid" in table
+
+
+def test_evaluation_is_repeatable(smoke_run: Path, tiny_data: Path, tmp_path: Path) -> None:
+    first, again = (
+        evaluate(smoke_run, tiny_data, views=(2,), out=tmp_path / f"{i}.json", progress=False)
+        for i in range(2)
+    )
+    assert first == again
