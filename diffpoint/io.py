@@ -1,0 +1,131 @@
+"""Point clouds and 16-bit depth maps on disk, through trimesh and imageio (extra `[io]`). Not imported by default."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffpoint import _checks
+
+_EMPTY = 65535  # the code of pixels that see nothing
+
+
+def encode_depth(depth: Tensor, *, max_depth: float = 10.0) -> np.ndarray:
+    """Depth in [0, max_depth), +inf where empty, as uint16: round(depth / max_depth * 65535); 65535 is empty.
+
+    Example:
+        >>> encode_depth(torch.tensor([2.0, float("inf")])).tolist()
+        [13107, 65535]
+    """
+    code = (depth.detach().double() * (_EMPTY / max_depth)).round().clamp(0, _EMPTY - 1)
+    return torch.where(torch.isfinite(depth), code, _EMPTY).numpy().astype(np.uint16)
+
+
+def decode_depth(code: np.ndarray, *, max_depth: float = 10.0) -> Tensor:
+    """The float32 depth of `encode_depth`'s codes, +inf where empty; exact to max_depth / 131070.
+
+    Example:
+        >>> decode_depth(np.array([13107, 65535], np.uint16)).tolist()
+        [2.0, inf]
+    """
+    depth = code.astype(np.float64) * (max_depth / _EMPTY)
+    return torch.from_numpy(np.where(code == _EMPTY, np.inf, depth).astype(np.float32))
+
+
+def write_depth(path: str | os.PathLike[str], depth: Tensor, *, max_depth: float = 10.0) -> None:
+    """Write a depth map (H, W) as a 16-bit PNG: z = value / 65535 * max_depth, 65535 where empty.
+
+    Raises:
+        ValueError: not one map, or depths that the code cannot hold.
+        ImportError: imageio is not installed.
+
+    Source: the released data of the CVPR 2019 paper (max_depth 10).
+    """
+    _checks.check_tensor("write_depth", "depth", depth, ("H", "W"))
+    encodable = ((depth >= 0) & (depth < max_depth)) | torch.isposinf(depth)
+    if not bool(encodable.all()):
+        where = tuple((~encodable).nonzero()[0].tolist())
+        got = f"{float(depth[where])} at index {where}"
+        raise _checks.fail("write_depth", "depth", f"lie in [0, {max_depth}), or be +inf where empty", got)
+    _replace(Path(path), lambda file: _imageio().imwrite(file, encode_depth(depth, max_depth=max_depth)))
+
+
+def read_depth(path: str | os.PathLike[str], *, max_depth: float = 10.0) -> Tensor:
+    """Read a depth map (H, W) float32, +inf where empty, as `write_depth` wrote it.
+
+    Raises:
+        ValueError: the file is not a 16-bit image with one channel.
+        OSError: it is missing or cannot be read.
+    """
+    code = _imageio().imread(path)
+    if code.dtype != np.uint16 or code.ndim != 2:
+        got = f"{code.dtype} {code.shape}"
+        raise _checks.fail("read_depth", "path", "name a 16-bit image with one channel", f"{path}: {got}")
+    return decode_depth(code, max_depth=max_depth)
+
+
+def write_points(path: str | os.PathLike[str], points: Tensor) -> None:
+    """Write a cloud (N, 3) as .ply (or another point format of trimesh); the file appears whole or not at all.
+
+    Raises:
+        ValueError: not one cloud, or coordinates that are not finite.
+        ImportError: trimesh is not installed.
+    """
+    _checks.check_tensor("write_points", "points", points, ("N", 3))
+    _checks.check_finite("write_points", "points", points.detach())
+    path = Path(path)
+    cloud = _trimesh().PointCloud(points.detach().to(torch.float32).numpy())
+    content = cloud.export(file_type=path.suffix.lstrip(".") or "ply")
+    _replace(
+        path, lambda file: file.write_bytes(content if isinstance(content, bytes) else str(content).encode())
+    )
+
+
+def read_points(path: str | os.PathLike[str]) -> Tensor:
+    """Read the vertices (N, 3) float32 of a point cloud or mesh file, in the file's frame and unit.
+
+    Raises:
+        ValueError: the file holds no finite points, or is of a kind that trimesh does not know.
+        OSError: it is missing.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"read_points: {path} does not exist.")
+    try:
+        loaded = _trimesh().load(path, process=False)
+        vertices = loaded.to_geometry().vertices if hasattr(loaded, "to_geometry") else loaded.vertices
+    except Exception as error:  # every format has its own exceptions; all mean that this is no cloud
+        raise _checks.fail("read_points", "path", "name a point cloud", f"{path}: {error}") from None
+    points = torch.from_numpy(np.array(vertices, np.float32).reshape(-1, 3))
+    if len(points) == 0 or not bool(torch.isfinite(points).all()):
+        raise _checks.fail("read_points", "path", "hold finite points", f"{path}: {len(points)} points")
+    return points
+
+
+def _replace(path: Path, write) -> None:
+    """Write beside the target and move into place, so that nobody ever reads half a file."""
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        scratch = Path(folder) / path.name
+        write(scratch)
+        os.replace(scratch, path)
+
+
+def _trimesh() -> ModuleType:
+    try:
+        import trimesh
+    except ImportError:
+        raise ImportError("diffpoint.io: point files need trimesh: pip install 'diffpoint[io]'.") from None
+    return trimesh
+
+
+def _imageio() -> ModuleType:
+    try:
+        import imageio.v3
+    except ImportError:
+        raise ImportError("diffpoint.io: depth maps need imageio: pip install 'diffpoint[io]'.") from None
+    return imageio.v3

@@ -1,0 +1,45 @@
+"""Clouds and depth maps survive the way to disk and back."""
+
+import pytest
+import torch
+
+from diffpoint import io
+
+
+def test_depth_maps_come_back_to_half_a_step(tmp_path):
+    depth = torch.rand(7, 5, generator=torch.Generator().manual_seed(0)) * 9.9
+    depth[2, 3] = torch.inf
+    io.write_depth(tmp_path / "d.png", depth)
+    again = io.read_depth(tmp_path / "d.png")
+    assert torch.isinf(again[2, 3])
+    seen = torch.isfinite(depth)
+    assert torch.equal(torch.isfinite(again), seen)
+    assert (again - depth)[seen].abs().max() <= 10 / 65535 / 2 + 1e-6
+    io.write_depth(tmp_path / "d.png", again)
+    assert torch.equal(io.read_depth(tmp_path / "d.png"), again)
+
+
+def test_clouds_come_back_to_the_last_bit(tmp_path):
+    points = torch.randn(30, 3, generator=torch.Generator().manual_seed(0))
+    io.write_points(tmp_path / "cloud.ply", points)
+    assert torch.equal(io.read_points(tmp_path / "cloud.ply"), points)
+    assert [p.name for p in tmp_path.iterdir()] == ["cloud.ply"]
+
+
+def test_what_is_no_cloud_and_no_map_is_refused(tmp_path):
+    text = tmp_path / "text.ply"
+    text.write_text("nothing of the kind")
+    with pytest.raises(ValueError, match=r"read_points: 'path' must name a point cloud; got .*text\.ply"):
+        io.read_points(text)
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        io.read_points(tmp_path / "missing.ply")
+    with pytest.raises(ValueError, match="lie in"):
+        io.write_depth(tmp_path / "d.png", torch.full((2, 2), 11.0))
+    with pytest.raises(ValueError, match="'points' must be finite"):
+        io.write_points(tmp_path / "c.ply", torch.full((2, 3), torch.nan))
+    import imageio.v3
+
+    imageio.v3.imwrite(tmp_path / "eight.png", torch.zeros(4, 4, dtype=torch.uint8).numpy())
+    with pytest.raises(ValueError, match="16-bit image with one channel"):
+        io.read_depth(tmp_path / "eight.png")
+    assert not list(tmp_path.glob(".*"))
