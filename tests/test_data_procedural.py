@@ -39,7 +39,7 @@ def test_the_front_hides_the_back(category):
             assert share[:5].max() < 0.01
             assert share[5] > 0.1
             noise = max(chamfer(*clouds[i]), chamfer(*clouds[j]))
-            assert chamfer(clouds[i][0], clouds[j][0]) > 1.9 * noise  # 2 for the acceptance's own samples
+            assert chamfer(clouds[i][0], clouds[j][0]) >= 2 * noise
         assert max(np.linalg.norm(s.vertices, axis=1).max() for v in variants for s in v) <= MAX_RADIUS
 
 

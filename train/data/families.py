@@ -22,7 +22,7 @@ MODES = 3
 FRONT_AZIMUTH_DEG, FRONT_ELEVATION_DEG = 15.0, 15.0
 """The front view: azimuth within +-15 degrees of the front, elevation 15."""
 
-_CHAIR_BACK_Z = 0.03
+_CHAIR_BACK_Z = 0.06
 
 Family = Callable[[np.random.Generator, np.random.Generator, int], list[Solid]]
 
@@ -30,7 +30,7 @@ Family = Callable[[np.random.Generator, np.random.Generator, int], list[Solid]]
 def chair(visible: np.random.Generator, hidden: np.random.Generator, mode: int) -> list[Solid]:
     """A chair with a solid back; what is hidden is how far the shell behind the back reaches."""
     seat_colour, frame_colour, shell_colour = _colours(visible)
-    width, depth = visible.uniform(0.32, 0.5), visible.uniform(0.2, 0.3)
+    width, depth = visible.uniform(0.32, 0.5), visible.uniform(0.18, 0.26)
     leg_height, back_height = visible.uniform(0.14, 0.28), visible.uniform(0.32, 0.44)
     thickness = visible.uniform(0.03, 0.08)
     seat_top = visible.uniform(-0.13, -0.06)
@@ -65,7 +65,7 @@ def chair(visible: np.random.Generator, hidden: np.random.Generator, mode: int) 
     shell = _hidden_body(
         hidden,
         mode,
-        depths=(0.0, 0.2, 0.46),
+        depths=(0.0, 0.21, 0.5),
         front=(top_width, low + 0.02, high, back_z),
         colour=shell_colour,
     )
@@ -208,7 +208,7 @@ def _hidden_body(
     """
     jitter, fill_start, fill_end, lift = (
         hidden.uniform(0.93, 1.0),
-        *hidden.uniform((0.88, 0.7, 0.2), (0.97, 0.95, 0.8)),
+        *hidden.uniform((0.92, 0.85, 0.2), (0.98, 1.0, 0.8)),
     )
     depth = depths[mode] * jitter
     if depth == 0:

@@ -21,6 +21,7 @@ from train.errors import UserError
 
 _JUDGED_SIZE = 112
 _SAME_DEPTH, _SAME_COLOUR = 1e-3, 3  # world units; steps of 255
+_SEPARATION = 2.2  # twice is the rule; other samples of the same shapes must find it too
 _ATTEMPTS = 60
 
 
@@ -43,7 +44,12 @@ class Ambiguity:
     @property
     def accepted(self) -> bool:
         """The same front, other backs, modes that can be told apart, and nothing that a frame would cut."""
-        return self.front < 0.01 and self.back > 0.1 and self.separation >= 2 and self.radius <= MAX_RADIUS
+        return (
+            self.front < 0.01
+            and self.back > 0.1
+            and self.separation >= _SEPARATION
+            and self.radius <= MAX_RADIUS
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -98,21 +98,24 @@ class Renderer:
     def _render_window(
         self, K: np.ndarray, cam_from_world: np.ndarray, rows: np.ndarray, columns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        centres = np.stack(np.meshgrid(columns + 0.5, rows + 0.5), axis=-1)
-        pixels = np.concatenate((centres[None], centres[None] + _COLOUR_OFFSETS[:, None, None]))
-        homogeneous = np.concatenate((pixels, np.ones((*pixels.shape[:-1], 1))), axis=-1).reshape(-1, 3)
+        # One ray through each pixel's centre for the depth, then the rays of the colour: (1 + 4, rows, columns, 3).
+        offsets = np.concatenate((np.zeros((1, 2)), _COLOUR_OFFSETS)) + 0.5
+        u = offsets[:, 0, None, None, None] + columns[:, None]
+        v = offsets[:, 1, None, None, None] + rows[:, None, None]
         rotation = cam_from_world[:3, :3]
-        directions = (homogeneous @ (np.linalg.inv(K).T @ rotation)).astype(np.float32)
+        per_u, per_v, constant = (rotation.T @ np.linalg.inv(K)).T
+        directions = (u * per_u + v * per_v + constant).astype(np.float32).reshape(-1, 3)
         eye = -rotation.T @ cam_from_world[:3, 3]
         hits = self._scene.run(
             np.broadcast_to(eye.astype(np.float32), directions.shape).copy(), directions, output=True
         )
-        count = centres.shape[0] * centres.shape[1]
+        window = (len(rows), len(columns))
+        count = len(rows) * len(columns)
         depth = np.where(hits["primID"][:count] >= 0, hits["tfar"][:count], np.float32(np.inf))
         colour_rays = {key: value[count:] for key, value in hits.items()}
         colours = self._shade(colour_rays, directions[count:], _LIGHT_IN_CAM @ rotation)
-        image = colours.reshape(len(_COLOUR_OFFSETS), *centres.shape[:2], 3).mean(0)
-        return (image * 255 + 0.5).astype(np.uint8), depth.reshape(centres.shape[:2])
+        image = colours.reshape(len(_COLOUR_OFFSETS), *window, 3).mean(0)
+        return (image * 255 + 0.5).astype(np.uint8), depth.reshape(window)
 
     def _shade(self, hits: dict, directions: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Lambert light on the side that is seen, whichever way a triangle is wound."""
