@@ -1,0 +1,102 @@
+"""The demo: data, training, evaluation, reconstruction and a report, through the functions of the commands."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from .checkpoint import best_weights
+from .config import PROFILES, FitConfig, scaled
+from .data import ShapeTree
+from .data.procedural import generate
+from .data.store import render_folder
+from .evaluate import evaluate
+from .files import write_text
+from .fit import fit
+from .reconstruction import reconstruct_to_files
+from .report import write_report
+
+# Two fifths of the profile's steps: about six minutes on two cores, and past the point where more views help.
+DEMO_CONFIG = scaled(PROFILES["cpu"], 0.4)
+_RENDER_SIZE = 112
+
+
+def demo(
+    out: Path, *, shapes: int = 400, seed: int = 0, config: FitConfig = DEMO_CONFIG, progress: bool = True
+) -> Path:
+    """Runs the whole chain on generated shapes; a second call continues where the first was stopped.
+
+    Args:
+        out: directory of everything: data/, run/, reconstruction/, figures/ and report.html.
+        shapes: generated objects, over all families and splits.
+        seed: of data and examples.
+        config: how to train.
+        progress: show bars.
+
+    Returns:
+        The report, out/report.html.
+
+    Raises:
+        UserError: `out` holds a demo with other settings, or something that is none.
+        KeyboardInterrupt: training was stopped; it has saved its state.
+    """
+    data, run = out / "data", out / "run"
+    clock = _Clock(out / "times.json")
+
+    with clock.phase("data", f"1/5 {shapes} shapes with more than one possible back -> {data}"):
+        print(generate(data, shapes=shapes, categories=None, seed=seed, size=_RENDER_SIZE).summary())
+
+    with clock.phase("training", f"2/5 training, {sum(s.steps for s in config.stages)} steps -> {run}"):
+        finished = fit(data, run, config, resume=(run / "config.json").exists(), progress=progress)
+    if not finished:
+        raise KeyboardInterrupt
+
+    with clock.phase("evaluation", "3/5 scoring on shapes that were kept out of training"):
+        if not _up_to_date(run):
+            evaluate(run, data, progress=progress)
+
+    test = ShapeTree(data, "test")
+    images = sorted(render_folder(data, test.ids[0]).glob("render_*.png"))
+    with clock.phase(
+        "reconstruction", f"4/5 one of them from its {len(images)} images -> {out / 'reconstruction'}"
+    ):
+        reconstruct_to_files(run, images, out / "reconstruction", seed=seed)
+
+    with clock.phase("report", "5/5 the report"):
+        page = write_report(out, run=run, data=data, seconds=clock.seconds, seed=seed)
+    print(f"\nDone in {sum(clock.seconds.values()) / 60:.1f} minutes. Open {page} in a browser.")
+    return page
+
+
+class _Clock:
+    """Seconds that each phase took until it was first finished, over all calls of the demo."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        known = json.loads(path.read_text()) if path.exists() else {"seconds": {}, "finished": []}
+        self.seconds: dict[str, float] = known["seconds"]
+        self._finished: list[str] = known["finished"]
+
+    @contextmanager
+    def phase(self, name: str, message: str) -> Iterator[None]:
+        print(f"\n{message}", flush=True)
+        begun, again = time.monotonic(), name in self._finished
+        try:
+            yield
+            self._finished += [] if again else [name]
+        finally:
+            if not again:
+                self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - begun
+            if self._path.parent.is_dir():
+                write_text(
+                    self._path, json.dumps({"seconds": self.seconds, "finished": self._finished}) + "\n"
+                )
+
+
+def _up_to_date(run: Path) -> bool:
+    """Was the run evaluated after its last weights were written?"""
+    evaluation = run / "evaluation.json"
+    return evaluation.exists() and evaluation.stat().st_mtime >= best_weights(run, 2).stat().st_mtime

@@ -1,0 +1,268 @@
+"""Pictures of clouds and of a run's curves, as matplotlib figures that belong to no window.
+
+Nothing here touches pyplot's global state; `save` writes a figure. Clouds are seen through a camera in
+perspective: near points are dark and large, far ones pale and small.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from diffpoint import PinholeCamera, project
+
+from .files import replacing
+
+PREDICTED = LinearSegmentedColormap.from_list("predicted", ["#0b2545", "#1f6f8b", "#5fb3b3", "#cfe8e0"])
+TRUE = LinearSegmentedColormap.from_list("true", ["#3d1f0c", "#a4562a", "#dd9f63", "#f6e3c5"])
+MUTED = "#6b7785"
+_CELL_INCHES = 2.1
+_DEPTH_RANGE = 0.45  # world units before and behind the origin over which a cloud fades
+_INK = 17_000  # square points of ink that a cloud's markers have together, in a cell
+
+
+class Example(NamedTuple):
+    """One test shape and what a generator made of it."""
+
+    images: Tensor
+    """(V, 3, H, W) all views, in [0, 1], of the cameras' size."""
+    camera: PinholeCamera
+    """(V,) their cameras."""
+    chosen: int
+    """The view that the predictions were made from."""
+    predictions: Tensor
+    """(R, N, 3) clouds from that one view and R codes."""
+    reconstruction: Tensor
+    """(M, 3) from all views."""
+    truth: Tensor
+    """(P, 3)."""
+
+    @property
+    def sides(self) -> tuple[PinholeCamera, PinholeCamera]:
+        """The chosen view's camera, and the same from behind."""
+        return self.camera[self.chosen], from_behind(self.camera[self.chosen])
+
+
+def from_behind(camera: PinholeCamera) -> PinholeCamera:
+    """The camera after half a turn around the world's vertical axis: the same height, the other side."""
+    half_turn = torch.diag(camera.cam_from_world.new_tensor([-1.0, 1.0, -1.0, 1.0]))
+    return PinholeCamera(camera.K, camera.cam_from_world @ half_turn, camera.height, camera.width)
+
+
+def close_up(images: Tensor, camera: PinholeCamera, points: Tensor) -> tuple[Tensor, PinholeCamera]:
+    """Cuts the same margin off all of an object's images, so that it fills them; cameras follow.
+
+    Args:
+        images: (V, 3, H, W).
+        camera: (V,), of H x W pixels.
+        points: (P, 3) of the object.
+    """
+    height, width = images.shape[-2:]
+    pixels = project(points[None], camera).pixels
+    away = (pixels / pixels.new_tensor([width, height]) - 0.5).abs().max().item()
+    share = max(0.0, 0.5 - 1.15 * away)
+    top, left = int(share * height), int(share * width)
+    K = camera.K.clone()
+    K[..., 0, 2] -= left
+    K[..., 1, 2] -= top
+    images = images[..., top : height - top, left : width - left]
+    return images, PinholeCamera(K, camera.cam_from_world, height - 2 * top, width - 2 * left)
+
+
+def draw_cloud(
+    axes: Axes, points: Tensor, camera: PinholeCamera, *, colours: LinearSegmentedColormap = PREDICTED
+) -> None:
+    """Draws a cloud (N, 3) as a single camera sees it; the axes show the camera's whole frame."""
+    projected = project(points[None], camera)
+    pixels, depth = projected.pixels[0, 0], projected.depth[0, 0]
+    order = depth.argsort(descending=True)
+    order = order[depth[order] > 0]
+    pixels, depth = pixels[order], depth[order]
+    middle = camera.cam_from_world[2, 3]  # depth of the world's origin, around which objects stand
+    tone = ((depth - middle) / (2 * _DEPTH_RANGE) + 0.5).clamp(0, 1)
+    area = _INK / max(len(points), 300) * (middle / depth).clamp(0.5, 2).square()
+    axes.scatter(pixels[:, 0], pixels[:, 1], s=area, c=colours(tone), linewidths=0.2, edgecolors="#ffffffa0")
+    axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
+    _bare(axes)
+
+
+def draw_image(axes: Axes, image: Tensor) -> None:
+    """Shows an image (3, H, W) in [0, 1], framed."""
+    axes.imshow(image.permute(1, 2, 0), interpolation="antialiased")
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_color("#d5dbe1")
+
+
+def mosaic(images: Tensor) -> Tensor:
+    """(V, 3, H, W) -> (3, rows * H, columns * W), as square as can be; what is left over stays white."""
+    columns = math.ceil(math.sqrt(len(images)))
+    blank = images.new_ones(-len(images) % columns, *images.shape[1:])
+    grid = torch.cat((images, blank)).unflatten(0, (-1, columns))
+    return grid.permute(2, 0, 3, 1, 4).flatten(3, 4).flatten(1, 2)
+
+
+def predictions_figure(example: Example) -> Figure:
+    """An image, several shapes it could be, the true one; seen from the image's side, and from behind."""
+    count = len(example.predictions)
+    figure, panels = _grid(rows=2, columns=count + 2)
+    draw_image(panels[0, 0], example.images[example.chosen])
+    _bare(panels[1, 0])
+    for row, camera in zip(panels, example.sides, strict=True):
+        for axes, cloud in zip(row[1:-1], example.predictions, strict=True):
+            draw_cloud(axes, cloud, camera)
+        draw_cloud(row[-1], example.truth, camera, colours=TRUE)
+    _titles(panels, ["the image", *(f"random code {i + 1}" for i in range(count)), "the true shape"])
+    _sides(panels[:, 1])
+    return figure
+
+
+def reconstruction_figure(example: Example) -> Figure:
+    """All views of a shape, what was found from them, and the true shape; from one side and from behind."""
+    figure, panels = _grid(rows=1, columns=5)
+    draw_image(panels[0, 0], mosaic(example.images))
+    for axes, camera in zip(panels[0, 1:3], example.sides, strict=True):
+        draw_cloud(axes, example.reconstruction, camera)
+    for axes, camera in zip(panels[0, 3:], example.sides, strict=True):
+        draw_cloud(axes, example.truth, camera, colours=TRUE)
+    _titles(
+        panels,
+        [f"{len(example.images)} images", "reconstruction", "from behind", "the true shape", "from behind"],
+    )
+    return figure
+
+
+def overview_figure(examples: Sequence[Example]) -> Figure:
+    """What the system does, in one picture: image, shapes it could be, the one that all images agree on, truth."""
+    count, views = len(examples[0].predictions), len(examples[0].images)
+    figure, panels = _grid(rows=2 * len(examples), columns=count + 3)
+    for example, (upper, lower) in zip(examples, panels.reshape(len(examples), 2, -1), strict=True):
+        draw_image(upper[0], example.images[example.chosen])
+        draw_image(lower[0], mosaic(example.images))
+        for row, camera in zip((upper, lower), example.sides, strict=True):
+            for axes, cloud in zip(row[1:-2], example.predictions, strict=True):
+                draw_cloud(axes, cloud, camera)
+            draw_cloud(row[-2], example.reconstruction, camera)
+            draw_cloud(row[-1], example.truth, camera, colours=TRUE)
+        _sides([upper[1], lower[1]])
+    guesses = [f"from this image, code {i + 1}" for i in range(count)]
+    _titles(panels, ["one image / all images", *guesses, f"from all {views} images", "the true shape"])
+    return figure
+
+
+def curves_figure(records: Sequence[dict[str, Any]]) -> Figure:
+    """A run's losses, validation errors and health over its steps, from the records of metrics.jsonl."""
+    figure = Figure(figsize=(13, 6.6), layout="constrained", dpi=110)
+    panels = np.asarray(figure.subplots(2, 3)).ravel()
+    stages = [[record for record in records if record.get("stage") == stage] for stage in (1, 2)]
+    for axes, stage, what in zip(panels[:2], stages, ("each view alone", "views joined"), strict=True):
+        _curves(axes, stage, {"front": "front constraint"})
+        axes.set_title(f"Stage {1 if stage is stages[0] else 2}, {what}: does the visible side fit?")
+    panels[0].set_ylabel("front constraint (EMD, sum)")
+    panels[1].set_ylabel("front constraint (chamfer x100)")
+    _curves(panels[2], records, {"diversity": "diversity loss"})
+    panels[2].set(title="Do different codes give different shapes?", ylabel="diversity loss")
+    _curves(
+        panels[3],
+        records,
+        {"val_cd_1": "one view", "val_cd": "all views joined", "val_fps_cd": "all views, thinned"},
+    )
+    panels[3].set(title="Error on shapes not trained on", ylabel="chamfer distance x100", ylim=(0, None))
+    _curves(panels[4], records, {"image_sensitivity": "with the image", "code_sensitivity": "with the code"})
+    panels[4].set(title="How far predictions move", ylabel="chamfer distance x100", ylim=(0, None))
+    _curves(panels[5], records, {"dead_share": "silent channels"})
+    panels[5].set(title="How much of the image trunk is silent?", ylabel="share", ylim=(-0.02, 1.02))
+    if stages[0] and stages[1]:
+        for axes in panels[2:]:
+            axes.axvline(stages[0][-1]["step"], color=MUTED, lw=0.8, ls="--")
+    return figure
+
+
+def errors_figure(result: dict[str, Any]) -> Figure:
+    """The error by number of images, beside answers without a network; from what `evaluate` returns."""
+    figure = Figure(figsize=(7.5, 4.2), layout="constrained", dpi=110)
+    axes = figure.subplots()
+    for label, rows, style in (
+        ("generator, search and descent on the codes", result["views"], "o-"),
+        ("generator, random codes", result["random_codes"], "o--"),
+        ("nearest training shape by image", result["nearest_image"], "s-"),
+    ):
+        colour = "#a4562a" if style[0] == "s" else "#1f6f8b"
+        axes.plot(
+            [int(n) for n in rows], [row["cd"] for row in rows.values()], style, color=colour, label=label
+        )
+    axes.axhline(result["medoid"]["cd"], color=MUTED, ls=":", label="most typical training shape (medoid)")
+    counts = [int(n) for n in result["views"]]
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(counts, [str(n) for n in counts])
+    axes.minorticks_off()
+    axes.set(xlabel="images of the object", ylabel="chamfer distance x100", ylim=(0, None))
+    axes.legend(fontsize=9)
+    _plain(axes)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a PNG, atomically."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", facecolor="white")
+
+
+def _grid(*, rows: int, columns: int) -> tuple[Figure, np.ndarray]:
+    """A figure of square cells, tightly set, with room for titles above and labels to the left."""
+    width, height = columns * _CELL_INCHES + 0.1, rows * _CELL_INCHES + 0.4
+    figure = Figure(figsize=(width, height), dpi=110)
+    panels = figure.subplots(rows, columns, squeeze=False)
+    top = 1 - 0.35 / height
+    figure.subplots_adjust(0.05 / width, 0.05 / height, 1 - 0.05 / width, top, wspace=0.04, hspace=0.04)
+    return figure, panels
+
+
+def _titles(panels: np.ndarray, titles: Sequence[str]) -> None:
+    for axes, title in zip(panels[0], titles, strict=True):
+        axes.set_title(title, fontsize=11)
+
+
+def _sides(upper_and_lower: Sequence[Axes] | np.ndarray) -> None:
+    for axes, side in zip(upper_and_lower, ("from the image's side", "from behind"), strict=True):
+        axes.text(0, 0.5, side, transform=axes.transAxes, fontsize=8, color=MUTED, rotation=90, va="center")
+
+
+def _curves(axes: Axes, records: Sequence[dict[str, Any]], names: dict[str, str]) -> None:
+    """One line for each figure, over the records that have it; noisy ones with their running mean."""
+    for (name, label), colour in zip(names.items(), ("#1f6f8b", "#c8553d", "#8a6d9e"), strict=False):
+        found = [(record["step"], record[name]) for record in records if record.get(name) is not None]
+        if not found:
+            continue
+        steps, values = np.array(found, float).T
+        window = len(values) // 25
+        if window < 2:
+            axes.plot(steps, values, ".-", color=colour, label=label, lw=1.2)
+            continue
+        axes.plot(steps, values, color=colour, alpha=0.25, lw=0.8)
+        kernel = np.ones(window)
+        mean = np.convolve(values, kernel, "same") / np.convolve(np.ones_like(values), kernel, "same")
+        axes.plot(steps, mean, color=colour, label=label, lw=1.6)
+    if len(names) > 1 and axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=9)
+    axes.set_xlabel("step")
+    axes.title.set_fontsize(11)
+    _plain(axes)
+
+
+def _plain(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.25)
+
+
+def _bare(axes: Axes) -> None:
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
