@@ -13,6 +13,7 @@ from diffpoint.losses import (
 )
 from diffpoint.reproject import Reprojection, project, reproject, unproject
 from diffpoint.sampling import farthest_point_sample
+from diffpoint.softmatch import approxmatch
 from diffpoint.splat import Splat, splat_depth
 from diffpoint.transport import Transport, earth_mover_distance
 from diffpoint.views import ViewSample, sample_view
@@ -31,6 +32,7 @@ __all__ = [
     "Splat",
     "Transport",
     "ViewSample",
+    "approxmatch",
     "chamfer_distance",
     "configure",
     "consistency_loss",

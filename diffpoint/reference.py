@@ -219,6 +219,40 @@ def assign(cost: Tensor) -> Tensor:
     return columns
 
 
+def approxmatch(
+    a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+) -> Tensor:
+    """Sum (*B) of the soft match's masses times distances; the match is held fixed for the gradient."""
+    batch = a.shape[:-2]
+    a3, b3 = a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:])
+    la = torch.full((len(a3),), a.shape[-2]) if a_lengths is None else a_lengths.reshape(-1)
+    lb = torch.full((len(b3),), b.shape[-2]) if b_lengths is None else b_lengths.reshape(-1)
+    costs = []
+    for x, y, n, m in zip(a3, b3, la.tolist(), lb.tolist(), strict=True):
+        squared = pairwise_squared_distance(x[:n], y[:m])
+        match = soft_match(squared.detach())
+        costs.append((match * _sqrt(squared)).sum())
+    return torch.stack(costs).reshape(batch)
+
+
+def soft_match(squared_distance: Tensor) -> Tensor:
+    """(n, m) masses that the released code's matching moves between the points."""
+    n, m = squared_distance.shape
+    supply = squared_distance.new_full((n, 1), max(m // n, 1))
+    demand = squared_distance.new_full((1, m), max(n // m, 1))
+    match = torch.zeros_like(squared_distance)
+    for level in [-(4.0**j) for j in range(7, -2, -1)] + [0.0]:
+        near = (level * squared_distance).exp()
+        offer = supply / ((near * demand).sum(1, keepdim=True) + 1e-9)
+        offered = demand * (near * offer).sum(0, keepdim=True)
+        request = demand * (demand / (offered + 1e-9)).clamp(max=1)
+        demand = (demand - offered).clamp(min=0)
+        moved = near * offer * request
+        match = match + moved
+        supply = (supply - moved.sum(1, keepdim=True)).clamp(min=0)
+    return match
+
+
 def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Tensor | None = None) -> Tensor:
     """Indices (*B, k)."""
     distance = points.new_full(points.shape[:-1], torch.inf)

@@ -185,6 +185,27 @@ def test_emd_ends_on_degenerate_sets(dtype, kind):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (40, 40), (50, 20), (20, 50), (33, 17)])
+def test_approxmatch_equals_its_twin(dtype, n, m):
+    a, b = leaf(2, n, 3, seed=1, dtype=dtype), leaf(2, m, 3, seed=2, dtype=dtype)
+    for lengths in ({}, {"a_lengths": torch.tensor([n, 1]), "b_lengths": torch.tensor([(m + 1) // 2, m])}):
+        ours, theirs = dp.approxmatch(a, b, **lengths), reference.approxmatch(a, b, **lengths)
+        assert_close(ours, theirs, scale=20)
+        x, y = (torch.autograd.grad(cost.sum(), (a, b)) for cost in (ours, theirs))
+        assert_close(x[0], y[0], scale=50)
+        assert_close(x[1], y[1], scale=50)
+
+
+def test_approxmatch_is_a_sum_a_little_above_the_optimum():
+    a, b = random(1, 256, 3, seed=1), random(1, 256, 3, seed=2)
+    ratio = dp.approxmatch(a, b) / (256 * dp.earth_mover_distance(a, b).cost)
+    assert 1.05 < ratio.item() < 1.5
+    assert dp.approxmatch(a, a).item() < 0.002 * 256
+    shifted = dp.approxmatch(a, a + 1e-4, a_lengths=torch.tensor([200]), b_lengths=torch.tensor([150]))
+    assert shifted.item() < 0.1 * 150
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(("n", "k"), [(1, 1), (15, 15), (16, 4), (17, 9), (500, 100)])
 def test_farthest_points_equal_the_plain_algorithm(dtype, n, k):
     points = random(2, 2, n, 3, seed=n, dtype=dtype)

@@ -25,6 +25,8 @@ SETS: Ops = {
     "chamfer_distance b": lambda x: dp.chamfer_distance(torch.rand(2, 5, 3), x, squared=True),
     "earth_mover_distance a": lambda x: dp.earth_mover_distance(x, torch.rand(2, 5, 3)),
     "earth_mover_distance b": lambda x: dp.earth_mover_distance(torch.rand(2, 5, 3), x),
+    "approxmatch a": lambda x: dp.approxmatch(x, torch.rand(2, 5, 3)),
+    "approxmatch b": lambda x: dp.approxmatch(torch.rand(2, 5, 3), x),
     "farthest_point_sample points": lambda x: dp.farthest_point_sample(x, 2),
 }
 STACKS: Ops = {

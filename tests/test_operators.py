@@ -25,6 +25,7 @@ def operator_arguments() -> dict[str, tuple]:
         "project": (a, projection, "project"),
         "unproject": (depth, camera.back_projection.clone().requires_grad_(), True, "unproject"),
         "earth_mover_distance": (a, b, *lengths, 0.02),
+        "approxmatch": (a, b, *lengths, True),
         "farthest_point_sample": (a.detach(), lengths[0], 3, 0),
         "sample_view": (a, dp.splat_depth(a, camera).visible),
     }

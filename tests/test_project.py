@@ -15,7 +15,7 @@ import diffpoint
 ROOT = Path(__file__).parent.parent
 FLOORS = ("diffpoint", "models", "train")  # from the ground up
 ABOVE = ("examples", "tests", "benchmarks")
-OPS = ("losses", "splat", "views", "reproject", "distances", "transport", "sampling")
+OPS = ("losses", "splat", "views", "reproject", "distances", "transport", "softmatch", "sampling")
 
 
 def imported(path: Path) -> set[str]:
