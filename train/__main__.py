@@ -158,10 +158,10 @@ class Reconstruct:
     """Pictures of one object."""
     out: Path
     """Directory to write to."""
-    groups: int = 5
-    """Groups of random codes to search."""
-    steps: int = 30
-    """Gradient steps on the codes."""
+    groups: int | None = None
+    """Groups of random codes to search; the run's own setting if not given."""
+    steps: int | None = None
+    """Gradient steps on the codes; the run's own setting if not given."""
     seed: int = 0
     """Draws the codes."""
 

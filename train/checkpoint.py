@@ -20,6 +20,7 @@ from torch import nn
 
 from models import Generator, GeneratorConfig, build_generator
 
+from .config import PROFILES, FitConfig, fit_config_from_json
 from .errors import UserError
 from .files import remove, replacing
 
@@ -55,6 +56,14 @@ def load_generator(run_or_file: str | Path) -> Generator:
     elif not path.exists():
         raise UserError(f"{path} does not exist; name a run that `fit` wrote, or a .safetensors file of one")
     return _read_generator(path).eval()
+
+
+def config_of(run_or_file: str | Path, model: Generator) -> FitConfig:
+    """The configuration of a run, or for a lone file of weights that of its profile."""
+    file = Path(run_or_file) / "config.json"
+    if file.exists():
+        return fit_config_from_json(file.read_text(), where=str(file))
+    return dataclasses.replace(PROFILES[model.profile], deterministic=model.config.deterministic)
 
 
 def _weights_of_run(run: Path) -> Path:

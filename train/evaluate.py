@@ -20,8 +20,8 @@ from tqdm import tqdm
 from models import Generator
 
 from .batches import LoadedSplit, load_split
-from .checkpoint import load_generator
-from .config import PROFILES, FitConfig, fit_config_from_json
+from .checkpoint import config_of, load_generator
+from .config import FitConfig
 from .errors import UserError
 from .files import write_text
 from .health import sensitivity
@@ -74,7 +74,7 @@ def evaluate(
         What was written.
     """
     model = load_generator(run)
-    config = _config_of(run, model)
+    config = config_of(run, model)
     test = _load(data, split, model, config, limit=limit, progress=progress)
     train = _load(data, "train", model, config, limit=None, progress=progress)
     counts = [n for n in views if n <= test.views]
@@ -188,13 +188,6 @@ def _one_image_per_shape(test: LoadedSplit) -> Tensor:
     """Up to 24 images of as many shapes as there are; a lone shape shows two of its views."""
     numbers = torch.arange(max(2, min(_SENSITIVITY_IMAGES, len(test))))
     return test.float_images(numbers % len(test), (numbers // len(test))[:, None])[:, 0]
-
-
-def _config_of(run: Path, model: Generator) -> FitConfig:
-    file = run / "config.json"
-    if file.exists():
-        return fit_config_from_json(file.read_text(), where=str(file))
-    return dataclasses.replace(PROFILES[model.profile], deterministic=model.config.deterministic)
 
 
 def _load(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import trimesh
 
-from .checkpoint import load_generator
+from .checkpoint import config_of, load_generator
 from .errors import UserError
 from .files import replacing
 from .images import read_images
@@ -17,11 +17,18 @@ MOST_IMAGES = 24
 
 
 def reconstruct_to_files(
-    run: Path, images: Sequence[Path], out: Path, *, groups: int = 5, steps: int = 30, seed: int = 0
+    run: Path,
+    images: Sequence[Path],
+    out: Path,
+    *,
+    groups: int | None = None,
+    steps: int | None = None,
+    seed: int = 0,
 ) -> None:
     """Reconstructs one object and writes reconstruction.ply and reconstruction.html into `out`.
 
-    Everything is read and computed before anything is written.
+    Everything is read and computed before anything is written. `groups` and `steps` are the run's if not
+    given.
 
     Raises:
         UserError: a run that is no run, an image that is no image, or a wrong number of either.
@@ -30,13 +37,16 @@ def reconstruct_to_files(
 
     if not 1 <= len(images) <= MOST_IMAGES:
         raise UserError(f"reconstruct takes 1 to {MOST_IMAGES} images; got {len(images)}")
-    if groups < 1 or steps < 0:
-        raise UserError(f"--groups must be at least 1 and --steps at least 0; got {groups} and {steps}")
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is a file; --out names a directory")
     model = load_generator(run)
+    inference = config_of(run, model).inference
+    groups = inference.groups if groups is None else groups
+    steps = inference.steps if steps is None else steps
+    if groups < 1 or steps < 0:
+        raise UserError(f"--groups must be at least 1 and --steps at least 0; got {groups} and {steps}")
     pictures = read_images(images)
-    found = reconstruct(model, pictures, groups=groups, steps=steps, seed=seed)
+    found = reconstruct(model, pictures, groups=groups, steps=steps, seed=seed, step_size=inference.step_size)
     points = found.points[0]
     made = f"{len(points)} points from {len(images)} image{'s' if len(images) > 1 else ''}"
     if len(found.history):
