@@ -85,6 +85,13 @@ def test_other_settings_or_a_foreign_folder_are_refused(tmp_path):
     store.claim(tmp_path / "data", {"size": SIZE})
     with pytest.raises(UserError, match="size 16 there, 32 now"):
         store.claim(tmp_path / "data", {"size": 32})
+    (tmp_path / "data" / "made_with.json").write_text("{")
+    with pytest.raises(UserError, match="cannot be read"):
+        store.claim(tmp_path / "data", {"size": SIZE})
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(UserError, match="choose"):
+            store.claim(out, {"size": SIZE})
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").touch()
     with pytest.raises(UserError, match="no dataset"):

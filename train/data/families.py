@@ -46,21 +46,8 @@ def chair(visible: np.random.Generator, hidden: np.random.Generator, mode: int) 
     plate_thickness = visible.uniform(0.025, 0.05)
     top_width = width * visible.uniform(0.75, 1.0)
     low, high = seat_top - 0.01, seat_top + back_height
-    plate = [
-        np.array(
-            [
-                (x * w / 2, y, z)
-                for z in (back_z, back_z + plate_thickness)
-                for x, y, w in (
-                    (-1, low, width),
-                    (1, low, width),
-                    (1, high, top_width),
-                    (-1, high, top_width),
-                )
-            ]
-        )[4 * k : 4 * k + 4]
-        for k in (0, 1)
-    ]
+    outline = np.array([(-width, low), (width, low), (top_width, high), (-top_width, high)]) * (0.5, 1)
+    plate = [np.column_stack((outline, np.full(4, z))) for z in (back_z, back_z + plate_thickness)]
     parts.append(loft(plate, seat_colour))
     shell = _hidden_body(
         hidden,

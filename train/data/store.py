@@ -163,12 +163,7 @@ def claim(out: Path, settings: dict) -> None:
     """
     marker = out / _SETTINGS
     if marker.is_file():
-        earlier = json.loads(marker.read_text())
-        changed = [
-            f"{key} {earlier.get(key)!r} there, {value!r} now"
-            for key, value in settings.items()
-            if earlier.get(key) != value
-        ]
+        changed = _changed_settings(marker, settings)
         if changed:
             raise UserError(
                 f"{out} holds data made with other settings ({'; '.join(changed)}); "
@@ -180,8 +175,23 @@ def claim(out: Path, settings: dict) -> None:
         raise UserError(
             f"{out} exists and is no dataset of this program; choose a new or empty folder for --out"
         )
-    out.mkdir(parents=True, exist_ok=True)
-    write_bytes_atomically(marker, json.dumps(settings, indent=1).encode())
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_bytes_atomically(marker, json.dumps(settings, indent=1).encode())
+    except OSError as error:
+        raise UserError(f"cannot write to {out} ({error.strerror}); choose another --out") from error
+
+
+def _changed_settings(marker: Path, settings: dict) -> list[str]:
+    try:
+        earlier = dict(json.loads(marker.read_text()))
+    except ValueError:
+        return [f"{marker.name} cannot be read"]
+    return [
+        f"{key} {earlier.get(key)!r} there, {value!r} now"
+        for key, value in settings.items()
+        if earlier.get(key) != value
+    ]
 
 
 def _remove_leftovers(root: Path) -> None:
