@@ -1,4 +1,5 @@
-"""The demo: data, training, evaluation, reconstruction and a report, through the functions of the commands."""
+"""The demo: data, training, evaluation, reconstruction and a report, through the functions of the
+commands."""
 
 from __future__ import annotations
 
@@ -51,8 +52,8 @@ def demo(
 
     with clock.phase("training", f"2/5 training, {sum(s.steps for s in config.stages)} steps -> {run}"):
         finished = fit(data, run, config, resume=(run / "config.json").exists(), progress=progress)
-    if not finished:
-        raise KeyboardInterrupt
+        if not finished:
+            raise KeyboardInterrupt
 
     with clock.phase("evaluation", "3/5 scoring on shapes that were kept out of training"):
         if not _up_to_date(run):

@@ -90,14 +90,16 @@ def draw_cloud(
     middle = camera.cam_from_world[2, 3]  # depth of the world's origin, around which objects stand
     tone = ((depth - middle) / (2 * _DEPTH_RANGE) + 0.5).clamp(0, 1)
     area = _INK / max(len(points), 300) * (middle / depth).clamp(0.5, 2).square()
-    axes.scatter(pixels[:, 0], pixels[:, 1], s=area, c=colours(tone), linewidths=0.2, edgecolors="#ffffffa0")
+    axes.scatter(
+        pixels[:, 0], pixels[:, 1], s=area, c=colours(tone.numpy()), linewidths=0.2, edgecolors="#ffffffa0"
+    )
     axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
     _bare(axes)
 
 
 def draw_image(axes: Axes, image: Tensor) -> None:
     """Shows an image (3, H, W) in [0, 1], framed."""
-    axes.imshow(image.permute(1, 2, 0), interpolation="antialiased")
+    axes.imshow(image.permute(1, 2, 0).numpy(), interpolation="antialiased")
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_color("#d5dbe1")
 
@@ -141,7 +143,8 @@ def reconstruction_figure(example: Example) -> Figure:
 
 
 def overview_figure(examples: Sequence[Example]) -> Figure:
-    """What the system does, in one picture: image, shapes it could be, the one that all images agree on, truth."""
+    """What the system does, in one picture: image, shapes it could be, the one that all images agree on,
+    truth."""
     count, views = len(examples[0].predictions), len(examples[0].images)
     figure, panels = _grid(rows=2 * len(examples), columns=count + 3)
     for example, (upper, lower) in zip(examples, panels.reshape(len(examples), 2, -1), strict=True):
