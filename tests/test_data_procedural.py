@@ -159,13 +159,13 @@ def test_wrong_requests_leave_nothing_behind(tmp_path, changes, message):
     assert not (tmp_path / "data").exists()
 
 
-def die_on_three(job):
-    if job == 3:
+def die_on_two(job):
+    if job == 2:
         os._exit(1)
     return job * 10
 
 
 def test_a_process_that_dies_takes_no_other_job_with_it():
-    results = dict(run_all(die_on_three, list(range(5)), processes=2, desc="dying", unit="job"))
-    assert isinstance(results.pop(3), OSError)
-    assert results == {0: 0, 1: 10, 2: 20, 4: 40}
+    results = dict(run_all(die_on_two, list(range(3)), processes=2, desc="dying", unit="job"))
+    assert isinstance(results.pop(2), OSError)
+    assert results == {0: 0, 1: 10}
