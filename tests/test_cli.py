@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import trimesh
 from PIL import Image
 
 from train.__main__ import main
+from train.config import fit_config_from_json
 from train.images import read_images
 
 
@@ -81,6 +83,23 @@ def test_the_process_says_so_too(tmp_path: Path) -> None:
     assert done.stdout == ""
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
+
+
+def test_fit_and_evaluate_from_the_command_line(
+    tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    fit = ["fit", "--data", str(tiny_data), "--out", str(run), "--profile", "smoke", "--steps", "2"]
+    assert main([*fit, "--stage1.codes", "3", "--seed", "7"]) == 0
+    config = fit_config_from_json((run / "config.json").read_text(), where="config.json")
+    assert (config.seed, config.stage1.codes, config.stage1.steps, config.stage2.steps) == (7, 3, 2, 2)
+    # A resumed run brings its own settings; only what contradicts them is refused.
+    assert main(["fit", "--data", str(tiny_data), "--out", str(run), "--resume"]) == 0
+    assert main(["fit", "--data", str(tiny_data), "--out", str(run), "--resume", "--seed", "8"]) == 2
+    capsys.readouterr()
+    assert main(["evaluate", str(run), "--data", str(tiny_data), "--seeds", "0", "--views", "1", "2"]) == 0
+    assert "medoid of train" in capsys.readouterr().out
+    assert list(json.loads((run / "evaluation.json").read_text())["views"]) == ["1", "2"]
 
 
 def test_reconstruct_writes_a_cloud_and_a_page(smoke_run: Path, picture: Path, tmp_path: Path) -> None:
