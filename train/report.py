@@ -101,7 +101,8 @@ def write_report(
 
 @torch.no_grad()
 def make_example(model: Generator, shape: Shape, config: FitConfig, *, seed: int) -> Example:
-    """A test shape, predictions from the image that shows its front best, and a reconstruction from all images."""
+    """A test shape, predictions from the image that shows its front best, and a reconstruction from all
+    images."""
     chosen = int(
         shape.camera.position[:, 2].argmax()
     )  # objects face +z: their backs are what this view hides
@@ -199,8 +200,9 @@ def _errors(result: dict[str, Any], drawn: dict[str, Any]) -> list[str]:
         pages.paragraph(
             "Mean distances from each point to the other cloud, x100; an object is about one unit across, so 1.00 is a "
             "hundredth of its size. Equal points: thinned to the size of one prediction, so that more images do not "
-            "gain by more points alone. Disagreement: between the predictions of an object's images. The two "
-            f"answers without a network: the most typical training shape, and the training shape whose pictures "
+            "gain by more points alone. Disagreement: between the predictions of an object's images. Random codes: "
+            "the same without the search for agreement. The two answers without a network: the most typical "
+            "training shape, and the training shape whose pictures "
             f"look most alike. With {most} images the generator's error (CD) is {typical} that of the most typical "
             f"shape and {alike} that of the shape that looks most alike."
         ),
