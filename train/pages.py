@@ -112,7 +112,7 @@ def cloud(points: Tensor, caption: str, *, height_px: int = 420, colours: str = 
     x, y, z = coordinates = points.detach().cpu().numpy().astype(np.float32).round(4).T
     # Plotly measures the eye's place in units of the cloud's mean extent; far enough to see all of it.
     extent = np.ptp(coordinates, axis=1).clip(1e-3) if len(points) else np.ones(3)
-    distance = 1.3 * np.linalg.norm(extent) / np.prod(extent) ** (1 / 3)
+    distance = 1.1 * np.linalg.norm(extent) / np.prod(extent) ** (1 / 3)
     eye = distance * np.array([0.5, 0.35, 0.79])
     marker = {"size": 3, "color": y, "colorscale": colours, "showscale": False}
     scatter = go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, hoverinfo="skip")
