@@ -37,7 +37,6 @@ def build(real):
         z_lanes: ti.template(),
         price_lanes: ti.template(),
         pair: ti.i32,
-        tiles: ti.i32,
         x: real,
         y: real,
         z: real,
@@ -47,7 +46,8 @@ def build(real):
         first = ti.Vector([real(far) for s in ti.static(range(LANES))])
         second = ti.Vector([real(far) for s in ti.static(range(LANES))])
         first_tile = ti.Vector([0 for s in ti.static(range(LANES))])
-        for t in range(tiles):
+        # The array's own size as the bound: with a computed one the compiler gives up on packing (5x slower).
+        for t in range(x_lanes.shape[1]):
             dx = x_lanes[pair, t] - x
             dy = y_lanes[pair, t] - y
             dz = z_lanes[pair, t] - z
@@ -97,7 +97,6 @@ def build(real):
                 pair = step // spread
                 n = ti.cast(person_counts[pair], ti.i32)
                 m = ti.cast(object_counts[pair], ti.i32)
-                tiles = (m + LANES - 1) // LANES
                 for j in range(price.shape[1]):
                     price[pair, j] = ti.select(j < m, real(0.0), real(far))
                 smallest_epsilon = ti.cast(ti.cast(extent[pair], ti.f64) * resolution, real)
@@ -108,13 +107,13 @@ def build(real):
                 bound[pair] = 0.0
                 finished[pair] = ti.u8(1)
                 running = n > 0
+                waiting = m
+                for i in range(m):
+                    object_of[pair, i] = -1
+                    person_of[pair, i] = -1
+                    queue[pair, i] = i
                 while running:
-                    for i in range(m):
-                        object_of[pair, i] = -1
-                        person_of[pair, i] = -1
-                        queue[pair, i] = i
                     head = 0
-                    waiting = m
                     while waiting > 0 and bids < bid_limit:
                         i = queue[pair, head]
                         head = ti.select(head + 1 == m, 0, head + 1)
@@ -127,7 +126,6 @@ def build(real):
                             z_lanes,
                             price_lanes,
                             pair,
-                            tiles,
                             persons[pair, row, 0],
                             persons[pair, row, 1],
                             persons[pair, row, 2],
@@ -155,30 +153,35 @@ def build(real):
                                 object_of[pair, i] = free
                                 person_of[pair, free] = i
                         finished[pair] = ti.u8(0)
+                    finer = ti.max(epsilon / real(SCALING), smallest_epsilon)
                     cost = ti.cast(0.0, ti.f64)
                     lower_bound = ti.cast(0.0, ti.f64)
+                    dissatisfied = 0
                     for i in range(m):
                         row = ti.min(i, n - 1)
                         weight = ti.select(i < n, real(1.0), real(0.0))
-                        if i < n:
-                            j = object_of[pair, i]
-                            dx = persons[pair, i, 0] - objects[pair, j, 0]
-                            dy = persons[pair, i, 1] - objects[pair, j, 1]
-                            dz = persons[pair, i, 2] - objects[pair, j, 2]
-                            cost += ti.cast(ti.sqrt(dx * dx + dy * dy + dz * dz), ti.f64)
+                        j = object_of[pair, i]
+                        dx = persons[pair, row, 0] - objects[pair, j, 0]
+                        dy = persons[pair, row, 1] - objects[pair, j, 1]
+                        dz = persons[pair, row, 2] - objects[pair, j, 2]
+                        distance = weight * ti.sqrt(dx * dx + dy * dy + dz * dz)
+                        cost += ti.cast(distance, ti.f64)
                         _, cheapest, _ = two_cheapest(
                             x_lanes,
                             y_lanes,
                             z_lanes,
                             price_lanes,
                             pair,
-                            tiles,
                             persons[pair, row, 0],
                             persons[pair, row, 1],
                             persons[pair, row, 2],
                             weight,
                         )
                         lower_bound += ti.cast(cheapest, ti.f64) - ti.cast(price[pair, i], ti.f64)
+                        # Who is within the next epsilon of the best offer keeps the object; the others bid again.
+                        if distance + price[pair, j] > cheapest + finer:
+                            queue[pair, dissatisfied] = i
+                            dissatisfied += 1
                     best_lower_bound = ti.max(best_lower_bound, lower_bound)
                     gap = ti.max(cost - best_lower_bound, 0.0)
                     bound[pair] = gap / n
@@ -191,7 +194,12 @@ def build(real):
                             finished[pair] = ti.u8(0)
                         running = False
                     else:
-                        epsilon = ti.max(epsilon / real(SCALING), smallest_epsilon)
+                        epsilon = finer
+                        waiting = dissatisfied
+                        for q in range(waiting):
+                            i = queue[pair, q]
+                            person_of[pair, object_of[pair, i]] = -1
+                            object_of[pair, i] = -1
 
     @ti.kernel
     def backward(
