@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 from types import ModuleType
 
@@ -64,7 +63,7 @@ def read_depth(path: str | os.PathLike[str], *, max_depth: float = 10.0) -> Tens
         OSError: it is missing or cannot be read.
     """
     code = _imageio().imread(path)
-    if code.dtype != np.uint16 or code.ndim != 2:
+    if code.dtype not in (np.uint16, np.int32) or code.ndim != 2:  # some decoders widen the 16 bits
         got = f"{code.dtype} {code.shape}"
         raise _checks.fail("read_depth", "path", "name a 16-bit image with one channel", f"{path}: {got}")
     return decode_depth(code, max_depth=max_depth)
@@ -109,10 +108,12 @@ def read_points(path: str | os.PathLike[str]) -> Tensor:
 
 def _replace(path: Path, write) -> None:
     """Write beside the target and move into place, so that nobody ever reads half a file."""
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        scratch = Path(folder) / path.name
+    scratch = path.with_name(f".{os.getpid()}-{path.name}")  # the ending still says the format
+    try:
         write(scratch)
         os.replace(scratch, path)
+    finally:
+        scratch.unlink(missing_ok=True)
 
 
 def _trimesh() -> ModuleType:

@@ -51,19 +51,11 @@ def test_round_trip(tmp_path):
     np.testing.assert_array_equal(shape.points, points)
 
 
-def test_depth_code_is_the_release_s():
-    depth = np.array([2.0, np.inf, 10.0, 0.0], np.float32)
-    code = store.encode_depth(depth)
-    assert code.tolist() == [13107, 65535, 65534, 0]
-    assert store.decode_depth(code)[1] == np.inf
-    assert store.decode_depth(code)[0] == pytest.approx(2.0)
-
-
 def test_a_shape_appears_complete_or_not_at_all(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr(store, "_ply_bytes", fail)
+    monkeypatch.setattr(store, "write_points", fail)
     with pytest.raises(OSError, match="disk full"):
         write(tmp_path, "03001627/one")
     assert not store.is_written(tmp_path, "03001627/one")

@@ -19,6 +19,13 @@ def test_depth_maps_come_back_to_half_a_step(tmp_path):
     assert torch.equal(io.read_depth(tmp_path / "d.png"), again)
 
 
+def test_the_depth_code_is_the_releases():
+    code = io.encode_depth(torch.tensor([2.0, torch.inf, 9.9999, 0.0]))
+    assert code.tolist() == [13107, 65535, 65534, 0]
+    assert io.decode_depth(code)[1] == torch.inf
+    assert io.decode_depth(code)[0] == pytest.approx(2.0)
+
+
 def test_clouds_come_back_to_the_last_bit(tmp_path):
     points = torch.randn(30, 3, generator=torch.Generator().manual_seed(0))
     io.write_points(tmp_path / "cloud.ply", points)

@@ -21,30 +21,18 @@ from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
-import trimesh
+import torch
 
+from diffpoint.io import encode_depth, write_points
 from train.data.render import Views
 from train.errors import UserError
+from train.files import write_text
 
 RENDERS, CLOUDS, LISTS = "rendered-shapenet", "pcdata_2048", "data_list"
 SPLITS = ("train", "val", "test")
 POINTS = 2048
 _SHARES = {"test": 0.2, "val": 0.1}
-_EMPTY, _MAX_DEPTH = 65535, 10.0
 _SETTINGS = "made_with.json"
-
-
-def encode_depth(depth: np.ndarray) -> np.ndarray:
-    """Metric depth, +inf where empty, to the code on disk."""
-    code = np.full(depth.shape, _EMPTY, np.uint16)
-    seen = np.isfinite(depth)
-    code[seen] = np.clip(np.rint(depth[seen] * (_EMPTY / _MAX_DEPTH)), 0, _EMPTY - 1)
-    return code
-
-
-def decode_depth(code: np.ndarray) -> np.ndarray:
-    """The code on disk to metric depth float32, +inf where empty."""
-    return np.where(code == _EMPTY, np.inf, code * (_MAX_DEPTH / _EMPTY)).astype(np.float32)
 
 
 def render_folder(root: Path, shape: str) -> Path:
@@ -76,7 +64,9 @@ def write_shape(root: Path, shape: str, views: Views, points: np.ndarray) -> Non
         K, cam_from_world = views.camera.K.tolist(), views.camera.cam_from_world.tolist()
         for i, (image, depth) in enumerate(zip(views.images, views.depth, strict=True)):
             imageio.imwrite(scratch / f"render_{i}.png", image, compress_level=3)
-            imageio.imwrite(scratch / f"depth_{i}.png", encode_depth(depth), compress_level=3)
+            imageio.imwrite(
+                scratch / f"depth_{i}.png", encode_depth(torch.from_numpy(depth)), compress_level=3
+            )
             record = {
                 "K": K[i],
                 "cam_from_world": cam_from_world[i],
@@ -84,24 +74,12 @@ def write_shape(root: Path, shape: str, views: Views, points: np.ndarray) -> Non
                 "width": views.camera.width,
             }
             (scratch / f"camera_{i}.json").write_text(json.dumps(record))
-        write_bytes_atomically(cloud, _ply_bytes(points))
+        write_points(cloud, torch.from_numpy(points.astype(np.float32)))
         if target.exists():
             shutil.rmtree(target)
         os.replace(scratch, target)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-
-
-def _ply_bytes(points: np.ndarray) -> bytes:
-    content = trimesh.PointCloud(points.astype(np.float32)).export(file_type="ply")
-    return content if isinstance(content, bytes) else str(content).encode()
-
-
-def write_bytes_atomically(path: Path, content: bytes) -> None:
-    """Replace a file in one step."""
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_bytes(content)
-    os.replace(scratch, path)
 
 
 def write_lists(root: Path, *, seed: int) -> dict[str, dict[str, int]]:
@@ -127,7 +105,7 @@ def write_lists(root: Path, *, seed: int) -> dict[str, dict[str, int]]:
             counts[split][synset] = len(lines)
             path = root / LISTS / split / f"{synset}.list"
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes_atomically(path, "".join(f"{line}\n" for line in lines).encode())
+            write_text(path, "".join(f"{line}\n" for line in lines))
     return counts
 
 
@@ -177,7 +155,7 @@ def claim(out: Path, settings: dict) -> None:
         )
     try:
         out.mkdir(parents=True, exist_ok=True)
-        write_bytes_atomically(marker, json.dumps(settings, indent=1).encode())
+        write_text(marker, json.dumps(settings, indent=1))
     except OSError as error:
         raise UserError(f"cannot write to {out} ({error.strerror}); choose another --out") from error
 

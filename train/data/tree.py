@@ -11,11 +11,11 @@ import imageio.v3 as imageio
 import numpy as np
 import scipy.io
 import torch
-import trimesh
 from torch import Tensor
 from tqdm import tqdm
 
 from diffpoint.camera import PinholeCamera
+from diffpoint.io import read_depth, read_points
 from train.data import store
 from train.data.categories import CATEGORY_OF, SYNSET_OF, category_of, synset_of
 from train.errors import UserError
@@ -157,7 +157,7 @@ def read_shape(root: Path, shape: str) -> Shape:
     if count == 0:
         raise ShapeError(f"{shape}: no render_*.png in {folder}")
     images = [_read(shape, folder / f"render_{i}.png", _read_image) for i in range(count)]
-    depth = [_read(shape, folder / f"depth_{i}.png", _read_depth) for i in range(count)]
+    depth = [_read(shape, folder / f"depth_{i}.png", read_depth) for i in range(count)]
     size = images[0].shape[1:]
     for i in range(count):
         if images[i].shape[1:] != size or depth[i].shape != size:
@@ -172,7 +172,7 @@ def read_shape(root: Path, shape: str) -> Shape:
         camera=PinholeCamera(
             torch.stack([K for K, _ in cameras]), torch.stack([pose for _, pose in cameras]), size[0], size[1]
         ),
-        points=_read(shape, store.cloud_file(root, shape), _read_cloud),
+        points=_read(shape, store.cloud_file(root, shape), read_points),
         id=shape,
         category=category_of(shape.split("/")[0]),
     )
@@ -198,13 +198,6 @@ def _read_image(path: Path) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
 
 
-def _read_depth(path: Path) -> Tensor:
-    code = imageio.imread(path)
-    if code.ndim != 2 or code.dtype not in (np.uint16, np.int32):
-        raise ValueError(f"a depth map has one channel of 16 bits; this has shape {code.shape}, {code.dtype}")
-    return torch.from_numpy(store.decode_depth(code))
-
-
 def _camera_file(folder: Path, view: int) -> Path:
     matlab = folder / f"camera_{view}.mat"
     return matlab if matlab.is_file() else folder / f"camera_{view}.json"
@@ -222,11 +215,3 @@ def _read_camera(path: Path) -> tuple[Tensor, Tensor]:
     K = np.array(record["K"], np.float32)
     PinholeCamera(torch.from_numpy(K), torch.from_numpy(pose), 1, 1)  # refuses what is no camera
     return torch.from_numpy(K), torch.from_numpy(pose)
-
-
-def _read_cloud(path: Path) -> Tensor:
-    with path.open("rb") as file:
-        vertices = np.array(trimesh.load(file, file_type="ply", process=False).vertices, np.float32)  # pyright: ignore
-    if vertices.ndim != 2 or len(vertices) == 0 or not np.isfinite(vertices).all():
-        raise ValueError("no finite points in it")
-    return torch.from_numpy(vertices)
