@@ -150,14 +150,14 @@ _FULL_STAGE2 = StageConfig(
     warmup=500,
 )  # fmt: skip
 _CPU_STAGE1 = StageConfig(
-    steps=4_000, shapes=12, views=1, codes=4, joined_views=False, front="emd", alpha=0.2, beta=10.0,
-    diversity_images=6, diversity_stride=2, ramp=(400, 1_200), select="cd",
-    learning_rate=5e-4, final_learning_rate=1e-4, warmup=200,
+    steps=4_000, shapes=16, views=1, codes=3, joined_views=False, front="emd", alpha=0.2, beta=10.0,
+    diversity_images=8, diversity_stride=2, ramp=(400, 1_200), select="cd",
+    learning_rate=5e-4, final_learning_rate=5e-5, warmup=200,
 )  # fmt: skip
 _CPU_STAGE2 = StageConfig(
-    steps=2_000, shapes=3, views=4, codes=4, joined_views=True, front="chamfer", alpha=0.1, beta=1.0,
-    diversity_images=6, diversity_stride=2, ramp=(0, 1), select="fps_cd",
-    learning_rate=3e-4, final_learning_rate=2e-5, warmup=100,
+    steps=2_000, shapes=4, views=4, codes=3, joined_views=True, front="chamfer", alpha=0.1, beta=1.0,
+    diversity_images=8, diversity_stride=2, ramp=(0, 400), select="fps_cd",
+    learning_rate=4e-4, final_learning_rate=1e-5, warmup=200,
 )  # fmt: skip
 _SMOKE_STAGE1 = dataclasses.replace(
     _CPU_STAGE1, steps=30, shapes=3, views=1, codes=2, diversity_images=2, ramp=(5, 20), warmup=5
@@ -171,7 +171,9 @@ PROFILES: dict[str, FitConfig] = {
         _FULL_STAGE1, _FULL_STAGE2, "full", map_size=56, validate_every=2_000, validation_shapes=200,
         checkpoint_every=1_000, health_every=500, health_patience=8_000,
     ),
-    "cpu": FitConfig(_CPU_STAGE1, _CPU_STAGE2, "cpu"),
+    # A step of 0.5 makes the views agree at the expense of coverage: on validation shapes it costs CD and
+    # gains nothing in FPS-CD, where 0.1 gains a little.
+    "cpu": FitConfig(_CPU_STAGE1, _CPU_STAGE2, "cpu", inference=InferenceConfig(step_size=0.1)),
     "smoke": FitConfig(
         _SMOKE_STAGE1, _SMOKE_STAGE2, "smoke", map_size=16, inference=InferenceConfig(groups=2, steps=3),
         validate_every=10, validation_shapes=4, checkpoint_every=10, health_every=10, health_patience=10_000,

@@ -78,10 +78,8 @@ def training_step(
         thin = slice(step % stage.diversity_stride, None, stage.diversity_stride)
         diversity = diversity_loss(codes[:, some], clouds[:, some, thin], alpha=stage.exact_alpha)
 
-    loss = (
-        front.loss + beta * diversity
-        # + the latent critic's opinion of the clouds: the third term of the paper's sum belongs here
-    )
+    # The paper's sum; its third term, the latent critic's opinion of the clouds, belongs here.
+    loss = front.loss + beta * diversity
 
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
@@ -167,6 +165,7 @@ def _run_stage(
         total=stage.steps, initial=training.step, desc=f"stage {number}", unit="step", disable=not progress
     )
     clock = _Clock()
+    shown: dict[str, str] = {}
     with bar:
         while training.step < stage.steps:
             with clock.waiting_for_data():
@@ -191,7 +190,8 @@ def _run_stage(
                 record["diversity_weight"] = stage.diversity_weight(training.step - 1)
                 record["learning_rate"] = stage.learning_rate_at(training.step - 1)
                 log.write(training.total_steps, record)
-                bar.set_postfix(_bar_values(record), refresh=False)
+                shown |= _bar_values(record)
+                bar.set_postfix(shown, refresh=False)
             if last or stop.requested or training.step % config.checkpoint_every == 0:
                 save_checkpoint(out, training.total_steps, training.model, training.state())
             if stop.requested:
