@@ -8,6 +8,10 @@ import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
+from diffpoint.blocks import sort_into_blocks
+
+# Pairs of points from which passing over boxes is faster than trying all pairs.
+_LARGE = 2**26
 
 
 class Nearest(NamedTuple):
@@ -145,10 +149,15 @@ def _nearest(
     squared_distance = a.new_empty(a.shape[:2])
     index = a.new_empty(a.shape[:2], dtype=torch.int64)
     if b.shape[1] == 0:
-        squared_distance.fill_(torch.inf)
+        padding = torch.arange(a.shape[1]) >= a_lengths[:, None]
+        squared_distance.fill_(torch.inf).masked_fill_(padding, 0)
         index.fill_(-1)
-    elif a.numel():
+    elif a.numel() and a.shape[1] * b.shape[1] < _LARGE:
         _bridge.launch("nearest", "forward", a.dtype, a, b, a_lengths, b_lengths, squared_distance, index)
+    elif a.numel():
+        x, y = sort_into_blocks(a, a_lengths), sort_into_blocks(b, b_lengths)
+        sets = x.points, x.order, y.points, y.order, y.boxes, y.groups, a_lengths, b_lengths
+        _bridge.launch("nearest", "forward_blocks", a.dtype, *sets, squared_distance, index)
     return squared_distance, index
 
 

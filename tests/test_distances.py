@@ -6,7 +6,7 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 import diffpoint as dp
-from diffpoint import reference
+from diffpoint import distances, reference
 from diffpoint.testing import assert_close, check_gradients
 
 DTYPES = (torch.float32, torch.float64)
@@ -49,6 +49,28 @@ def test_nearest_takes_uneven_and_empty_sets(dtype):
     assert (gradient[1, 7:] == 0).all()
     assert dp.nearest(a, b[:, :0]).index.eq(-1).all()
     assert dp.nearest(a[:, :0], b).index.shape == (4, 0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (33, 70), (500, 3000), (3000, 500)])
+@pytest.mark.parametrize("kind", ["random", "lattice", "one place", "line", "extreme"])
+def test_large_and_small_sets_are_searched_with_the_same_result(monkeypatch, dtype, n, m, kind):
+    """The search that passes over boxes gives the bits of the one that tries every pair, ties included."""
+    a, b = random(3, n, 3, seed=1, dtype=dtype), random(3, m, 3, seed=2, dtype=dtype)
+    if kind == "lattice":
+        a, b = (a * 4).round(), (b * 4).round()
+    elif kind == "one place":
+        a, b = torch.full_like(a, 0.3), torch.full_like(b, 0.3)
+    elif kind == "line":
+        a[..., 1:] = b[..., 1:] = 0
+    elif kind == "extreme":
+        a, b = a * 1e6, b * 1e-6
+    lengths = {"a_lengths": torch.tensor([n, n // 2, n]), "b_lengths": torch.tensor([m, m, m // 3])}
+    every_pair = dp.nearest(a, b, **lengths)
+    monkeypatch.setattr(distances, "_LARGE", 0)
+    with_boxes = dp.nearest(a, b, **lengths)
+    assert torch.equal(every_pair.index, with_boxes.index)
+    assert torch.equal(every_pair.squared_distance, with_boxes.squared_distance)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -1,0 +1,48 @@
+"""Clouds in spatial order with the boxes of their parts: what lets exact searches pass over most of a large cloud."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffpoint import _bridge
+
+BLOCK = 32  # as in kernels/blocks.py
+GROUP = 32
+_MOST_BITS = 6
+
+
+class Blocks(NamedTuple):
+    """A batch of clouds sorted along a Morton curve."""
+
+    points: Tensor
+    """(B, 32 ceil(N / 32), 3), in the curve's order; the padding lies far away."""
+    order: Tensor
+    """(B, N) int32: where each of them was before."""
+    boxes: Tensor
+    """(B, 6, ceil(N / 32)) least and greatest corner of every 32 points."""
+    groups: Tensor
+    """(B, 6, ceil(N / 1024)) the same of every 32 boxes."""
+
+
+def sort_into_blocks(points: Tensor, lengths: Tensor) -> Blocks:
+    """Sort clouds (B, N, 3) of the given lengths (B,); O(N) time and memory."""
+    batch, size, _ = points.shape
+    # About as many cells as points: finer keys cost memory, coarser ones leave points within a cell unsorted.
+    bits = 2
+    while bits < _MOST_BITS and 8 ** (bits + 1) <= 2 * size:
+        bits += 1
+    boxes = -(-size // BLOCK)
+    result = Blocks(
+        points.new_empty((batch, boxes * BLOCK, 3)),
+        torch.empty((batch, size), dtype=torch.int32),
+        points.new_empty((batch, 6, boxes)),
+        points.new_empty((batch, 6, -(-boxes // GROUP))),
+    )
+    key = torch.empty((batch, size), dtype=torch.int32)
+    histogram = torch.empty((batch, 8**bits), dtype=torch.int32)
+    scratch = result.points, result.order, key, histogram, result.boxes, result.groups
+    _bridge.launch("blocks", "sort", points.dtype, points, lengths, *scratch, bits)
+    return result
