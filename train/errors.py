@@ -2,4 +2,5 @@
 
 
 class UserError(Exception):
-    """A mistake the user can mend: the message says what, where and how. `python -m train` exits with code 2."""
+    """A mistake the user can mend: the message says what, where and how. `python -m train` exits with code
+    2."""
