@@ -11,6 +11,7 @@ from diffpoint import _bridge
 
 BLOCK = 32  # as in kernels/blocks.py
 GROUP = 32
+_LANES = 16
 _MOST_BITS = 6
 
 
@@ -18,13 +19,13 @@ class Blocks(NamedTuple):
     """A batch of clouds sorted along a Morton curve."""
 
     points: Tensor
-    """(B, 32 ceil(N / 32), 3), in the curve's order; the padding lies far away."""
+    """(B, N', 3) in the curve's order, N' the next multiple of 512; the padding lies far away."""
     order: Tensor
-    """(B, N) int32: where each of them was before."""
+    """(B, N') int32: where each of them was before; a large number in the padding."""
     boxes: Tensor
-    """(B, 6, ceil(N / 32)) least and greatest corner of every 32 points."""
+    """(B, 6, N' / 32) least and greatest corner of every 32 points."""
     groups: Tensor
-    """(B, 6, ceil(N / 1024)) the same of every 32 boxes."""
+    """(B, 6, ceil(N' / 1024)) the same of every 32 boxes."""
 
 
 def sort_into_blocks(points: Tensor, lengths: Tensor) -> Blocks:
@@ -34,10 +35,10 @@ def sort_into_blocks(points: Tensor, lengths: Tensor) -> Blocks:
     bits = 2
     while bits < _MOST_BITS and 8 ** (bits + 1) <= 2 * size:
         bits += 1
-    boxes = -(-size // BLOCK)
+    boxes = -(-size // (BLOCK * _LANES)) * _LANES  # whole vectors of boxes
     result = Blocks(
         points.new_empty((batch, boxes * BLOCK, 3)),
-        torch.empty((batch, size), dtype=torch.int32),
+        torch.full((batch, boxes * BLOCK), 2**31 - 1, dtype=torch.int32),
         points.new_empty((batch, 6, boxes)),
         points.new_empty((batch, 6, -(-boxes // GROUP))),
     )

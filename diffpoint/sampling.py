@@ -7,8 +7,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from diffpoint import _bridge, _checks
+from diffpoint.blocks import sort_into_blocks
 
 _LANES = 16  # as in kernels/sampling.py
+_LARGE = 4096  # points from which passing over boxes is faster than updating every distance
 
 
 def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Tensor | None = None) -> Tensor:
@@ -65,11 +67,25 @@ def _farthest(points: Tensor, lengths: Tensor, k: int, start: int) -> Tensor:
     chosen = torch.empty((batch, k), dtype=torch.int64)
     if chosen.numel() == 0:
         return chosen
-    axes = lanes(points)
-    counts = torch.arange(axes[0].shape[1] * _LANES) < lengths[:, None]
-    distance = torch.where(counts, torch.inf, -1.0).to(points.dtype).view(axes[0].shape)
-    _bridge.launch("sampling", "farthest", points.dtype, points, *axes, distance, chosen, start)
+    if size < _LARGE:
+        axes = lanes(points)
+        distance = _unset_distance(points, lengths, axes[0][0].numel()).view(axes[0].shape)
+        _bridge.launch("sampling", "farthest", points.dtype, points, *axes, distance, chosen, start)
+        return chosen
+    blocks = sort_into_blocks(points, lengths)
+    distance = _unset_distance(points, lengths, blocks.points.shape[1]).view(batch, -1, _LANES)
+    box_farthest = points.new_empty((batch, blocks.boxes.shape[2]))
+    box_point = torch.zeros(box_farthest.shape, dtype=torch.int32)
+    scratch = distance, box_farthest, box_farthest.view(batch, -1, _LANES), box_point
+    axes = lanes(blocks.points)
+    sorted_points = blocks.points, *axes, blocks.order, blocks.boxes.view(batch, 6, -1, _LANES)
+    _bridge.launch("sampling", "farthest_blocks", points.dtype, *sorted_points, *scratch, chosen, start)
     return chosen
+
+
+def _unset_distance(points: Tensor, lengths: Tensor, size: int) -> Tensor:
+    """(B, size): farther than any point, and -1 in the padding, so that it is never chosen."""
+    return torch.where(torch.arange(size) < lengths[:, None], torch.inf, -1.0).to(points.dtype)
 
 
 def lanes(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:

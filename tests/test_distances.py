@@ -6,7 +6,7 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 import diffpoint as dp
-from diffpoint import distances, reference
+from diffpoint import distances, reference, sampling
 from diffpoint.testing import assert_close, check_gradients
 
 DTYPES = (torch.float32, torch.float64)
@@ -236,6 +236,27 @@ def test_farthest_points_equal_the_plain_algorithm(dtype, n, k):
         assert torch.equal(ours, reference.farthest_point_sample(points, k, start=start))
         assert (ours[..., 0] == start).all()
         assert all(len(row.unique()) == k for row in ours.view(-1, k))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("n", [1, 31, 32, 33, 700])
+@pytest.mark.parametrize("kind", ["random", "lattice", "one place", "line"])
+def test_farthest_points_of_large_and_small_clouds_come_in_the_same_order(monkeypatch, dtype, n, kind):
+    points = random(3, n, 3, seed=n, dtype=dtype)
+    if kind == "lattice":
+        points = (points * 4).round()
+    elif kind == "one place":
+        points = torch.full_like(points, 0.3)
+    elif kind == "line":
+        points[..., 1:] = 0
+    lengths = torch.tensor([n, max(n // 2, 1), n])
+    k = max(1, n // 2)
+    for start in {0, max(n // 2, 1) - 1}:
+        every_distance = dp.farthest_point_sample(points, k, start=start, lengths=lengths)
+        with monkeypatch.context() as patch:
+            patch.setattr(sampling, "_LARGE", 0)
+            with_boxes = dp.farthest_point_sample(points, k, start=start, lengths=lengths)
+        assert torch.equal(every_distance, with_boxes)
 
 
 def test_farthest_points_stay_within_the_lengths():

@@ -41,7 +41,8 @@ def build(real):
     ):
         """Counting sort by Morton key with `bits` bits for each axis (stable), then the boxes of every 32 points.
 
-        ordered has whole boxes, filled up with points far away. order: where each sorted point came from. boxes and groups: (B, 6, count) least and greatest corners.
+        ordered has whole boxes, filled up with points far away. order: where each sorted point came from.
+        boxes and groups: (B, 6, count) least and greatest corners.
         """
         for step in range(points.shape[0] * spread):
             if step % spread == 0:

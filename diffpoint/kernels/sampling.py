@@ -1,10 +1,12 @@
-"""Farthest point sampling: every step updates all distances in vector lanes and takes the largest."""
+"""Farthest point sampling, with every distance updated at every step, or only those in boxes a step can reach."""
 
 from types import SimpleNamespace
 
 from diffpoint.kernels._backend import ti
+from diffpoint.kernels.blocks import BLOCK
 
 LANES = 16
+PARTS = BLOCK // LANES  # vectors in a box
 
 
 def build(real):
@@ -57,4 +59,114 @@ def build(real):
                         current = ti.select(better, candidate, current)
                         best = ti.select(better, d, best)
 
-    return SimpleNamespace(farthest=farthest)
+    boxes3 = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=3)
+    scalars2 = ti.types.ndarray(dtype=real, ndim=2)
+    orders2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
+
+    @ti.kernel
+    def farthest_blocks(
+        points: points3,
+        x_lanes: lanes2,
+        y_lanes: lanes2,
+        z_lanes: lanes2,
+        order: orders2,
+        box_lanes: boxes3,
+        distance: lanes2,
+        box_farthest: scalars2,
+        box_farthest_lanes: lanes2,
+        box_point: orders2,
+        chosen: indices2,
+        start: ti.i32,
+        spread: ti.i32,
+    ):
+        """`points`, `order`, `box_lanes` as sorted by `blocks.sort`; `distance` +inf, and -1 in the padding.
+
+        A new point changes distances only in boxes that lie nearer to it than their farthest distance. Equal
+        distances go to the lowest index before sorting, as in the plain algorithm.
+        """
+        for step in range(points.shape[0] * spread):
+            if step % spread == 0:
+                cloud = step // spread
+                current = 0
+                for i in range(order.shape[1]):
+                    if order[cloud, i] == start:
+                        current = i
+                for box in range(box_farthest.shape[1]):
+                    box_farthest[cloud, box] = distance[cloud, box * PARTS].max()
+                for k in range(chosen.shape[1]):
+                    chosen[cloud, k] = order[cloud, current]
+                    x = points[cloud, current, 0]
+                    y = points[cloud, current, 1]
+                    z = points[cloud, current, 2]
+                    best_lanes = ti.Vector([real(-2.0) for s in ti.static(range(LANES))])
+                    tile_lanes = ti.Vector([0 for s in ti.static(range(LANES))])
+                    tied_lanes = ti.Vector([0 for s in ti.static(range(LANES))])
+                    for t in range(box_lanes.shape[2]):
+                        gap = ti.Vector([real(0.0) for s in ti.static(range(LANES))])
+                        for axis in ti.static(range(3)):
+                            here = points[cloud, current, axis]
+                            below = box_lanes[cloud, axis, t] - here
+                            above = here - box_lanes[cloud, axis + 3, t]
+                            for s in ti.static(range(LANES)):
+                                outside = ti.select(below[s] > above[s], below[s], above[s])
+                                outside = ti.select(outside > 0, outside, real(0.0))
+                                gap[s] += outside * outside
+                        farthest_lanes = box_farthest_lanes[cloud, t]
+                        reached = 0
+                        for s in ti.static(range(LANES)):
+                            reached += ti.select(gap[s] < farthest_lanes[s], 1, 0)
+                        if reached > 0:
+                            for s in range(LANES):
+                                within = 0
+                                for r in ti.static(range(LANES)):
+                                    within = ti.select((r == s) & (gap[r] < farthest_lanes[r]), 1, within)
+                                if within != 0:
+                                    box = t * LANES + s
+                                    farthest_here = real(-1.0)
+                                    point = box * BLOCK
+                                    for part in range(PARTS):
+                                        row = box * PARTS + part
+                                        dx = x_lanes[cloud, row] - x
+                                        dy = y_lanes[cloud, row] - y
+                                        dz = z_lanes[cloud, row] - z
+                                        to_current = dx * dx + dy * dy + dz * dz
+                                        nearest = distance[cloud, row]
+                                        for r in ti.static(range(LANES)):
+                                            nearest[r] = ti.select(
+                                                to_current[r] < nearest[r], to_current[r], nearest[r]
+                                            )
+                                        distance[cloud, row] = nearest
+                                        for r in ti.static(range(LANES)):
+                                            i = row * LANES + r
+                                            if nearest[r] >= farthest_here:
+                                                lower = order[cloud, i] < order[cloud, point]
+                                                farther = (nearest[r] > farthest_here) | lower
+                                                point = ti.select(farther, i, point)
+                                                farthest_here = nearest[r]
+                                    box_farthest[cloud, box] = farthest_here
+                                    box_point[cloud, box] = point
+                            farthest_lanes = box_farthest_lanes[cloud, t]
+                        for s in ti.static(range(LANES)):
+                            farther = farthest_lanes[s] > best_lanes[s]
+                            equal = farthest_lanes[s] == best_lanes[s]
+                            tied_lanes[s] = ti.select(farther, 0, ti.select(equal, 1, tied_lanes[s]))
+                            tile_lanes[s] = ti.select(farther, t, tile_lanes[s])
+                            best_lanes[s] = ti.select(farther, farthest_lanes[s], best_lanes[s])
+                    best = best_lanes[0]
+                    best_box = tile_lanes[0] * LANES
+                    tied = tied_lanes[0]
+                    for s in ti.static(range(1, LANES)):
+                        farther = best_lanes[s] > best
+                        equal = best_lanes[s] == best
+                        tied = ti.select(farther, tied_lanes[s], ti.select(equal, 1, tied))
+                        best_box = ti.select(farther, tile_lanes[s] * LANES + s, best_box)
+                        best = ti.select(farther, best_lanes[s], best)
+                    if tied != 0:
+                        for box in range(box_farthest.shape[1]):
+                            lower = (
+                                order[cloud, box_point[cloud, box]] < order[cloud, box_point[cloud, best_box]]
+                            )
+                            best_box = ti.select((box_farthest[cloud, box] == best) & lower, box, best_box)
+                    current = box_point[cloud, best_box]
+
+    return SimpleNamespace(farthest=farthest, farthest_blocks=farthest_blocks)
