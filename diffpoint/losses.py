@@ -7,6 +7,7 @@ the unit of the clouds; the paper's sums and factors of 100 are applied where it
 from __future__ import annotations
 
 import itertools
+import math
 import warnings
 from typing import Literal, NamedTuple
 
@@ -16,7 +17,7 @@ from torch import Tensor
 from diffpoint import _checks
 from diffpoint.camera import PinholeCamera
 from diffpoint.distances import chamfer_distance
-from diffpoint.reproject import unproject
+from diffpoint.reproject import check_depth, unproject
 from diffpoint.splat import splat_depth
 from diffpoint.transport import earth_mover_distance
 from diffpoint.views import sample_view
@@ -115,6 +116,8 @@ def front_constraint(
     """
     _checks.check_choice("front_constraint", "distance", distance, ("chamfer", "emd"))
     sets = front_sets(points, camera, depth)
+    if points.shape[1] == 0:
+        raise _checks.fail("front_constraint", "points", "hold at least one point", str(tuple(points.shape)))
     empty = sets.observed_lengths == 0
     for happened, what in (
         (sets.fallback & ~empty, "no predicted point is visible"),
@@ -138,6 +141,8 @@ def front_constraint(
         else:
             value = earth_mover_distance(seen, observed, tolerance=tolerance, **lengths).cost
         loss = loss.masked_scatter(kept, value)
+    else:
+        loss = loss + 0 * points.sum()  # a gradient of 0, so that a step on such a batch does not fail
     return _reduce("front_constraint", loss, reduction)
 
 
@@ -172,6 +177,8 @@ def projection_loss(
         0.0
     """
     _check_maps("projection_loss", points, camera, depth)
+    if not torch.compiler.is_compiling():
+        check_depth("projection_loss", "depth", depth.detach())
     rendered = splat_depth(points, camera).depth
     both = torch.isfinite(depth) & torch.isfinite(rendered)
     # Where not both are finite the difference is replaced before it is taken: inf - inf would poison the gradient.
@@ -209,6 +216,10 @@ def diversity_loss(
     _checks.check_tensor("diversity_loss", "codes", codes, ("R", "B", "D"))
     _checks.check_tensor("diversity_loss", "clouds", clouds, (*codes.shape[:2], "N", 3))
     _checks.check_same_dtype("diversity_loss", codes=codes, clouds=clouds)
+    if not math.isfinite(alpha):
+        raise _checks.fail("diversity_loss", "alpha", "be finite", repr(alpha))
+    if not torch.compiler.is_compiling():
+        _checks.check_finite("diversity_loss", "codes", codes.detach())
     first, second = _pairs("diversity_loss", "codes", codes.shape[0])
     moved = earth_mover_distance(clouds[first], clouds[second], tolerance=tolerance).cost
     apart = (codes[first] - codes[second]).norm(dim=-1)
@@ -263,4 +274,8 @@ def _check_maps(function: str, points: Tensor, camera: PinholeCamera, depth: Ten
 
 def _reduce(function: str, loss: Tensor, reduction: Reduction) -> Tensor:
     _checks.check_choice(function, "reduction", reduction, ("mean", "none"))
+    if reduction == "mean" and loss.numel() == 0:
+        raise _checks.fail(
+            function, "reduction", "be 'none' where there is nothing to take the mean of", "'mean'"
+        )
     return loss.mean() if reduction == "mean" else loss

@@ -161,7 +161,7 @@ def _project(points: Tensor, projection: Tensor, caller: str) -> tuple[Tensor, T
     if depth.numel():
         cameras = projection.reshape(batch * views, 12)
         _bridge.launch("reproject", "project", points.dtype, points, cameras, pixels, depth, views)
-    return pixels.view(batch, views, -1, 2), depth.view(batch, views, -1)
+    return pixels.view(batch, views, points.shape[1], 2), depth.view(batch, views, points.shape[1])
 
 
 @_bridge.register(
@@ -223,7 +223,7 @@ def _unproject(depth: Tensor, back_projection: Tensor, compact: bool, caller: st
         maps = depth.reshape(batch * views, height, width)
         matrices = back_projection.reshape(batch * views, 12)
         _bridge.launch("reproject", "unproject", depth.dtype, maps, matrices, points, lengths, int(compact))
-    return points.view(batch, views, -1, 3), lengths.view(batch, views)
+    return points.view(batch, views, height * width, 3), lengths.view(batch, views)
 
 
 @_bridge.register(

@@ -75,6 +75,7 @@ def _approxmatch(
     cost = torch.zeros(count, dtype=torch.float64)
     if count == 0:
         return cost.to(a.dtype), a.new_zeros(a.shape), b.new_zeros(b.shape)
+    a, b = _without_padding(a, a_lengths), _without_padding(b, b_lengths)
     a_lanes, b_lanes = torch.stack(lanes(a)), torch.stack(lanes(b))
     supply = _masses(a_lanes, a_lengths, (b_lengths // a_lengths).clamp(min=1))
     demand = _masses(b_lanes, b_lengths, (a_lengths // b_lengths).clamp(min=1))
@@ -103,6 +104,12 @@ def _approxmatch(
     unit_a = grad_a.view(3, count, -1)[..., :n].movedim(0, -1).contiguous()
     unit_b = grad_b.view(3, count, -1)[..., :m].movedim(0, -1).contiguous()
     return cost.to(a.dtype), unit_a, unit_b
+
+
+def _without_padding(points: Tensor, lengths: Tensor) -> Tensor:
+    """Zeros in the padding: it has no mass, but no mass times NaN would be NaN."""
+    padding = torch.arange(points.shape[1]) >= lengths[:, None]
+    return points.masked_fill(padding[..., None], 0)
 
 
 def _masses(like: Tensor, lengths: Tensor, mass: Tensor) -> Tensor:

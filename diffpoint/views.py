@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -35,7 +36,8 @@ def sample_view(points: Tensor, splat: Splat) -> ViewSample:
     Gradients: of `points` to x, y and z of the chosen points; none through the choice.
 
     Raises:
-        ValueError, TypeError: `points` and `splat` of different sizes, wrong dtype or device.
+        ValueError, TypeError: `points` and `splat` of different sizes, wrong dtype or device, NaN or infinite
+            coordinates of a point that a view sees.
 
     Source: CVPR 2019 paper, section 3.2.
 
@@ -102,6 +104,9 @@ def _sample_view(points: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tenso
             index.view(flat, largest),
             views,
         )
+        if not math.isfinite(float(sampled.sum())):  # one pass over the sample, not over the cloud
+            unseen = ~visible.any(1)
+            _checks.check_finite("sample_view", "points", points.masked_fill(unseen[..., None], 0))
     return sampled, index, lengths
 
 

@@ -11,6 +11,14 @@ from pathlib import Path
 import pytest
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """How many cases the property tests threw."""
+    passed = terminalreporter.stats.get("passed", [])
+    cases = sum(value for report in passed for name, value in report.user_properties if name == "cases")
+    if cases:
+        terminalreporter.write_line(f"{cases} property cases passed")
+
+
 @pytest.fixture(scope="session")
 def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tree of 12 chairs and displays, 4 views of 64 x 64 pixels each."""

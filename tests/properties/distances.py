@@ -1,0 +1,155 @@
+"""Nearest neighbours, chamfer, earth mover's distance, soft matching and farthest points against their twins."""
+
+from __future__ import annotations
+
+import torch
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+import diffpoint as dp
+from diffpoint import reference
+from properties import strategies as throw
+from properties.judge import (
+    AGREED,
+    REFUSED,
+    assert_finite_gradients,
+    assert_within,
+    eps,
+    magnitude,
+    refuse_or_run,
+)
+
+
+def check_nearest(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
+    a, b = (r.make() for r in recipes)
+    lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
+    result = refuse_or_run(
+        lambda: dp.nearest(a.points, b.points, **lengths), a.poisoned or b.poisoned, "nearest"
+    )
+    if result is None:
+        return REFUSED
+    x, y = a.clean, b.clean
+    squared, _ = reference.nearest(x, y, **lengths)
+    assert_within(result.squared_distance, squared, 16 * eps(x.dtype) * squared)
+    real = result.index >= 0
+    inside = torch.arange(x.shape[-2]) < a.counts[..., None]
+    assert torch.equal(real, inside & (b.counts > 0)[..., None])
+    assert (result.index < b.counts[..., None]).all()
+    if y.shape[-2]:
+        chosen = torch.take_along_dim(y, result.index.clamp(min=0)[..., None], -2)
+        attained = (x - chosen).double().square().sum(-1)
+        assert_within(attained[real], squared[real].double(), 16 * eps(x.dtype) * squared[real])
+        twins = (chosen[..., :, None, :] == y[..., None, :, :]).all(-1)
+        assert torch.equal(twins.to(torch.uint8).argmax(-1)[real], result.index[real]), "the lowest of equals"
+        gradient, _ = assert_finite_gradients(result.squared_distance, a.points, b.points)
+        expected = torch.where(real[..., None], 2 * (x - chosen), 0.0)
+        assert_within(gradient, expected, 8 * eps(x.dtype) * expected.abs())
+    return AGREED
+
+
+def _empty(*clouds: throw.Cloud) -> bool:
+    """Has one of them a set without points?"""
+    return any(c.points.shape[-2] == 0 or bool((c.counts == 0).any()) for c in clouds)
+
+
+def check_chamfer_distance(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
+    a, b = (r.make() for r in recipes)
+    lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
+    refuse = a.poisoned or b.poisoned or _empty(a, b)
+    for squared in (True, False):
+        result = refuse_or_run(
+            lambda s=squared: dp.chamfer_distance(a.points, b.points, squared=s, **lengths),
+            refuse,
+            "chamfer_distance",
+        )
+        if result is None:
+            return REFUSED
+        expected = reference.chamfer_distance(a.clean, b.clean, squared=squared, **lengths)
+        for ours, theirs in zip(result, expected, strict=True):
+            assert_within(ours, theirs, 100 * eps(ours.dtype) * theirs)
+        assert_finite_gradients(torch.stack(result), a.points, b.points)
+    return AGREED
+
+
+def check_earth_mover_distance(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
+    a, b = (r.make() for r in recipes)
+    lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
+    result = refuse_or_run(
+        lambda: dp.earth_mover_distance(a.points, b.points, **lengths),
+        a.poisoned or b.poisoned or _empty(a, b),
+        "earth_mover_distance",
+    )
+    if result is None:
+        return REFUSED
+    assert_finite_gradients(result.cost, a.points, b.points)
+    x, y, cost, assignment, bound, converged = (
+        t.detach().reshape(a.counts.numel(), *t.shape[a.counts.dim() :]) for t in (a.clean, b.clean, *result)
+    )
+    for i, (n, m) in enumerate(zip(a.counts.flatten().tolist(), b.counts.flatten().tolist(), strict=True)):
+        p, q = x[i, :n], y[i, :m]
+        slack = 1e3 * eps(p.dtype) * magnitude(p, q)
+        matched = (assignment[i] >= 0).nonzero()[:, 0]
+        partners = assignment[i, matched]
+        assert len(partners) == min(n, m) == len(partners.unique())
+        assert (matched < n).all()
+        assert (partners < m).all()
+        assert_within(cost[i], (p[matched] - q[partners]).norm(dim=-1).mean(), slack)
+        excess = float(cost[i]) - _least_mean_cost(p, q)
+        assert -slack <= excess <= float(bound[i]) + slack
+        assert not converged[i] or bound[i] <= 0.02 * cost[i] + slack
+    return AGREED
+
+
+def _least_mean_cost(p: Tensor, q: Tensor) -> float:
+    """By the twin; by scipy where the twin would take seconds."""
+    if len(p) * len(q) <= 400:
+        return float(reference.earth_mover_distance(p.double(), q.double())[0])
+    matrix = reference.pairwise_squared_distance(p.double(), q.double()).sqrt().numpy()
+    return float(matrix[linear_sum_assignment(matrix)].mean())
+
+
+def check_approxmatch(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
+    a, b = (r.make() for r in recipes)
+    lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
+    result = refuse_or_run(
+        lambda: dp.approxmatch(a.points, b.points, **lengths),
+        a.poisoned or b.poisoned or _empty(a, b),
+        "approxmatch",
+    )
+    if result is None:
+        return REFUSED
+    if result.numel():
+        expected = reference.approxmatch(a.clean, b.clean, **lengths)
+        mass = torch.maximum(a.counts, b.counts)
+        # Masses of 1 are moved over ten rounds, each a quotient of sums; what is left of them is a difference.
+        assert_within(result, expected, 2e4 * eps(result.dtype) * mass * 2 * magnitude(a.clean, b.clean))
+    assert_finite_gradients(result, a.points, b.points)
+    return AGREED
+
+
+def check_farthest_point_sample(recipe: throw.Recipe, k: int, start: int) -> str:
+    cloud = recipe.make()
+    smallest = int(cloud.counts.min()) if cloud.counts.numel() else 0
+    refuse = cloud.counts.numel() > 0 and (cloud.poisoned or k > smallest or start > max(smallest - 1, 0))
+    chosen = refuse_or_run(
+        lambda: dp.farthest_point_sample(cloud.points, k, start=start, lengths=cloud.lengths),
+        refuse,
+        "farthest_point_sample",
+    )
+    if chosen is None:
+        return REFUSED
+    assert chosen.shape == (*recipe.batch, k)
+    if recipe.family in ("lattice", "one point") and chosen.numel():  # arithmetic is exact: so are the ties
+        expected = reference.farthest_point_sample(cloud.clean, k, start=start, lengths=cloud.lengths)
+        assert torch.equal(chosen, expected)
+    batch = cloud.counts.numel()
+    points, rows = cloud.clean.reshape(batch, recipe.count, 3), chosen.reshape(batch, k)
+    for whole, n, row in zip(points, cloud.counts.flatten().tolist(), rows, strict=True):
+        real = whole[:n]
+        distance = torch.full((n,), torch.inf, dtype=torch.float64)
+        for step, i in enumerate(row.tolist()):
+            assert i == start if step == 0 else distance[i] >= distance.max() * (1 - 16 * eps(recipe.dtype))
+            if step:
+                assert not (real[:i] == real[i]).all(-1).any() or distance[i] == 0, "the lowest of equals"
+            distance = torch.minimum(distance, (real - real[i]).double().square().sum(-1))
+    return AGREED

@@ -1,0 +1,118 @@
+"""The four losses against their twins."""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+
+import diffpoint as dp
+from diffpoint import reference
+from properties import strategies as throw
+from properties.judge import (
+    AGREED,
+    BANDED,
+    REFUSED,
+    assert_finite_gradients,
+    assert_within,
+    eps,
+    magnitude,
+    refuse_or_run,
+)
+from properties.rendering import Maps, decided_pixels, image_bounds, twins_camera
+
+
+def _same_picture(cloud: throw.Cloud, camera: dp.PinholeCamera) -> bool:
+    """Do the op and its twin certainly see the same points? Then the losses on top of them can be compared."""
+    matrices = twins_camera(camera, len(cloud.points))
+    at = image_bounds(cloud.clean, *matrices)
+    if not bool(decided_pixels(at, camera, 0.0, cloud.counts).all()):
+        return False
+    splat = dp.splat_depth(cloud.points.detach(), camera)
+    return torch.equal(
+        splat.index, reference.splat_depth(cloud.clean, *matrices, camera.height, camera.width)[1]
+    )
+
+
+def _check_view_loss(case: Maps, name: str, **options) -> str:
+    cloud, camera, depth, poisoned = case.make()
+    loss_of, twin = getattr(dp, name), getattr(reference, name)
+    nothing = len(depth) == 0 or case.views == 0
+    no_points = name == "front_constraint" and cloud.points.shape[1] == 0
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="front_constraint: in ", category=RuntimeWarning)
+        refuse_or_run(
+            lambda: loss_of(cloud.points, camera, depth, **options),
+            cloud.poisoned or poisoned or nothing or no_points,
+            *(name, "splat_depth", "unproject"),
+        )
+        loss = refuse_or_run(
+            lambda: loss_of(cloud.points, camera, depth, reduction="none", **options),
+            cloud.poisoned or poisoned or no_points,
+            *(name, "splat_depth", "unproject"),
+        )
+    if loss is None:
+        return REFUSED
+    assert loss.shape == depth.shape[:2]
+    assert torch.isfinite(loss).all()
+    assert_finite_gradients(loss, cloud.points, depth)
+    if not _same_picture(cloud, camera):
+        return BANDED
+    matrices = [m.expand(*depth.shape[:2], *m.shape[-2:]) for m in twins_camera(camera, len(depth))]
+    if loss.numel():
+        expected = twin(cloud.clean, *matrices, depth.detach(), **options)
+        foreground = depth.detach()[torch.isfinite(depth)]
+        size = magnitude(cloud.clean, foreground) + 10
+        slack = 500 * eps(loss.dtype) * size
+        # The twin's assignment is exact; the op's costs at most its tolerance more.
+        above = 0.021 * expected if options.get("distance") == "emd" else 0.0
+        assert bool(((loss >= expected - slack) & (loss <= expected + above + slack)).all())
+    return AGREED
+
+
+def check_front_constraint(case: Maps, distance: str) -> str:
+    return _check_view_loss(case, "front_constraint", distance=distance)
+
+
+def check_projection_loss(case: Maps) -> str:
+    return _check_view_loss(case, "projection_loss")
+
+
+def check_diversity_loss(recipe: throw.Recipe, dimension: int, alpha: float, poison: float | None) -> str:
+    cloud = recipe.make()
+    codes = torch.randn(*recipe.batch, dimension, generator=torch.Generator().manual_seed(recipe.seed))
+    codes = codes.to(recipe.dtype)
+    code_poisoned = poison is not None and codes.numel() > 0
+    if code_poisoned:
+        codes.view(-1)[recipe.seed % codes.numel()] = poison
+    codes.requires_grad_()
+    size, shapes = recipe.batch
+    refuse = cloud.poisoned or code_poisoned or size < 2 or shapes == 0 or cloud.points.shape[-2] == 0
+    loss = refuse_or_run(
+        lambda: dp.diversity_loss(codes, cloud.points, alpha=alpha),
+        refuse,
+        "diversity_loss",
+        "earth_mover_distance",
+    )
+    if loss is None:
+        return REFUSED
+    assert_finite_gradients(loss, codes, cloud.points)
+    expected = reference.diversity_loss(codes.detach(), cloud.clean, alpha=alpha).mean()
+    slack = 1e3 * eps(recipe.dtype) * (alpha * magnitude(cloud.clean) + 10)
+    below = 0.06 * alpha * 2 * magnitude(cloud.clean)  # the op's transport costs at most its tolerance more
+    assert expected - below - slack <= loss <= expected + slack
+    return AGREED
+
+
+def check_consistency_loss(recipe: throw.Recipe) -> str:
+    cloud = recipe.make()
+    refuse = cloud.poisoned or recipe.batch[-1] < 2 or recipe.count == 0 or 0 in recipe.batch
+    loss = refuse_or_run(
+        lambda: dp.consistency_loss(cloud.points), refuse, "consistency_loss", "chamfer_distance"
+    )
+    if loss is None:
+        return REFUSED
+    expected = reference.consistency_loss(cloud.clean).mean()
+    assert_within(loss, expected, 100 * eps(recipe.dtype) * expected)
+    assert_finite_gradients(loss, cloud.points)
+    return AGREED

@@ -1,0 +1,184 @@
+"""Every op, thrown everything: it agrees with its twin, or raises an error of this library. Never NaN, never a crash.
+
+Sizes from 0, both dtypes, strides, extreme coordinates, duplicates, collapsed and flat clouds, NaN and infinity: see
+`properties/strategies.py`. Where an input is refused is stated by each check, so that neither a missing refusal nor a
+needless one passes.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections import Counter
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, seed, settings
+from hypothesis import strategies as st
+from properties import distances, losses, rendering
+from properties import strategies as throw
+from properties.judge import AGREED, REFUSED
+
+import diffpoint as dp
+
+EXAMPLES = 20  # of every family of clouds, at every op
+
+
+@st.composite
+def renderings(
+    draw: st.DrawFn, largest: int, family: str, *, lengths: bool = True, radius: bool = True
+) -> rendering.Rendering:
+    batch = draw(throw.sizes)
+    recipe = draw(throw.recipes(largest, family=family, batch=(batch,), lengths=lengths))
+    radii = st.sampled_from([0.0, 0.0, 0.5, 1.0, 2.3, 50.0])
+    return rendering.Rendering(recipe, draw(throw.cameras(batch)), draw(radii) if radius else 0.0)
+
+
+@st.composite
+def maps(draw: st.DrawFn, largest: int, family: str) -> rendering.Maps:
+    batch, views = draw(throw.sizes), draw(throw.sizes)
+    recipe = draw(throw.recipes(largest, family=family, batch=(batch,), lengths=False))
+    camera, target = (draw(throw.cameras(batch, draw(st.sampled_from([1, views])))) for _ in range(2))
+    return rendering.Maps(recipe, camera, target, draw(throw.depths), views)
+
+
+def batches(largest: int, family: str) -> st.SearchStrategy[throw.Recipe]:
+    """Batches with two leading dimensions; the losses want two of one or the other."""
+    shapes = st.tuples(st.sampled_from([2, 2, 3, 1]), st.sampled_from([2, 2, 3, 1, 0]))
+    return shapes.flatmap(lambda batch: throw.recipes(largest, family=family, batch=batch, lengths=False))
+
+
+def arguments(name: str, largest: int, family: str) -> tuple[st.SearchStrategy, ...]:
+    """The strategies of a check's arguments; `largest` is the largest number of points."""
+    small = min(largest, 40)  # where the twin takes time with the cube of the number
+    return {
+        "nearest": (throw.pairs(largest, family),),
+        "chamfer_distance": (throw.pairs(largest, family),),
+        "earth_mover_distance": (throw.pairs(largest // 2, family),),
+        "approxmatch": (throw.pairs(largest // 2, family),),
+        "farthest_point_sample": (
+            throw.recipes(largest, family=family),
+            st.integers(0, 40),
+            st.sampled_from([0, 0, 0, 1, 40]),
+        ),
+        "splat_depth": (renderings(largest, family),),
+        "sample_view": (renderings(largest, family),),
+        "project": (renderings(largest, family, lengths=False, radius=False),),
+        "unproject": (maps(1, family),),
+        "reproject": (maps(1, family),),
+        "front_constraint": (maps(small, family), st.sampled_from(["chamfer", "emd"])),
+        "projection_loss": (maps(largest, family),),
+        "diversity_loss": (
+            batches(small // 2, family),
+            st.integers(0, 5),
+            st.sampled_from([0.0, 1.0, 500.0]),
+            st.sampled_from([None, None, None, math.nan, math.inf]),
+        ),
+        "consistency_loss": (batches(largest, family),),
+    }[name]
+
+
+CHECKS = {
+    name.removeprefix("check_"): check
+    for module in (distances, rendering, losses)
+    for name, check in vars(module).items()
+    if name.startswith("check_")
+}
+
+
+def throw_at(name: str, *, largest: int, examples: int) -> Counter[str]:
+    """What came of every case; `examples` of each family of clouds."""
+    outcomes: Counter[str] = Counter()
+    for family in throw.FAMILIES:
+
+        @seed(
+            zlib.crc32(f"{name} {family}".encode())
+        )  # other choices for every op and family, the same in every run
+        @settings(
+            max_examples=examples, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck)
+        )
+        @given(st.tuples(*arguments(name, largest, family)))
+        def run(case) -> None:
+            outcomes[CHECKS[name](*case)] += 1
+
+        run()
+    return outcomes
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_agrees_with_its_twin_or_refuses(name, record_property):
+    outcomes = throw_at(name, largest=300, examples=EXAMPLES)
+    record_property("cases", outcomes.total())
+    assert outcomes[AGREED] >= 30
+    assert outcomes[REFUSED] >= 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHECKS)
+def test_agrees_with_its_twin_or_refuses_at_length(name, record_property):
+    outcomes = throw_at(name, largest=3000, examples=EXAMPLES)
+    record_property("cases", outcomes.total())
+    assert outcomes[AGREED] >= 30
+    assert outcomes[REFUSED] >= 5
+
+
+def test_every_op_is_thrown_at():
+    not_ops = {"approxmatch", "configure", "front_sets", "runtime_info"} - set(CHECKS)
+    functions = {name for name in dp.__all__ if name[0].islower()}
+    assert functions - not_ops == set(CHECKS)
+
+
+# What the above has found, kept by name.
+
+
+def test_nearest_leaves_the_padding_zero_where_the_other_set_is_empty():
+    result = dp.nearest(torch.zeros(1, 3, 3), torch.zeros(1, 0, 3), a_lengths=torch.tensor([1]))
+    assert result.squared_distance.tolist() == [[math.inf, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_approxmatch_does_not_look_at_the_padding(dtype):
+    a, b = torch.rand(1, 20, 3, dtype=dtype), torch.rand(1, 20, 3, dtype=dtype)
+    lengths = {"a_lengths": torch.tensor([11]), "b_lengths": torch.tensor([13])}
+    before = dp.approxmatch(a, b, **lengths)
+    a[0, 11:], b[0, 13:] = math.nan, math.inf
+    assert torch.equal(dp.approxmatch(a, b, **lengths), before)
+
+
+def test_projections_of_no_clouds_and_of_no_views():
+    camera = dp.PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=3, width=2)
+    assert dp.project(torch.zeros(0, 5, 3), camera).pixels.shape == (0, 1, 5, 2)
+    assert dp.unproject(torch.zeros(0, 1, 3, 2), camera).points.shape == (0, 1, 6, 3)
+    assert dp.reproject(torch.zeros(2, 0, 3, 2), camera, camera).valid.shape == (2, 0, 3, 2)
+
+
+def test_view_sampling_refuses_to_hand_on_nan():
+    camera = dp.PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
+    splat = dp.splat_depth(torch.zeros(1, 2, 3), camera)
+    points = torch.zeros(1, 2, 3)
+    points[0, 1] = math.nan  # not seen: the first point wins the pixel
+    assert dp.sample_view(points, splat).lengths.item() == 1
+    with pytest.raises(ValueError, match="sample_view: 'points' must be finite"):
+        dp.sample_view(points.flip(1), splat)
+
+
+def test_losses_of_nothing_and_of_nan():
+    camera = dp.PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
+    points, empty = torch.zeros(1, 2, 3, requires_grad=True), torch.full((1, 1, 4, 4), math.inf)
+    with pytest.warns(RuntimeWarning, match="the depth map is empty"):
+        dp.front_constraint(
+            points, camera, empty
+        ).backward()  # a batch without foreground does not end the training
+    assert (points.grad == 0).all()
+    for loss in (dp.front_constraint, dp.projection_loss):
+        with pytest.raises(ValueError, match="'none' where there is nothing to take the mean of"):
+            loss(points[:0], camera, empty[:0])
+    with pytest.raises(ValueError, match="front_constraint: 'points' must hold at least one"):
+        dp.front_constraint(points[:, :0], camera, empty)
+    with pytest.raises(ValueError, match="projection_loss: 'depth' must be positive"):
+        dp.projection_loss(points, camera, torch.full_like(empty, math.nan))
+    clouds = torch.zeros(2, 1, 4, 3)
+    with pytest.raises(ValueError, match="diversity_loss: 'codes' must be finite"):
+        dp.diversity_loss(torch.full((2, 1, 3), math.nan), clouds, alpha=1.0)
+    with pytest.raises(ValueError, match="diversity_loss: 'alpha' must be finite"):
+        dp.diversity_loss(torch.zeros(2, 1, 3), clouds, alpha=math.nan)
