@@ -1,5 +1,6 @@
 """The runtime in fresh processes: silent, lazy, polite to a host program's Taichi, clear after a fork."""
 
+import os
 import subprocess
 import sys
 import textwrap
@@ -100,7 +101,7 @@ def test_kernels_are_parallel_in_a_host_programs_taichi():
     assert printed(textwrap.dedent(HOST) + textwrap.dedent(code)).splitlines()[-1] == "parallel"
 
 
-@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="no fork on this system")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_a_forked_child_gets_an_error_instead_of_a_hang():
     code = """
         import os, sys, warnings
@@ -122,7 +123,7 @@ def test_a_forked_child_gets_an_error_instead_of_a_hang():
     assert "spawn" in output
 
 
-@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="no fork on this system")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_a_child_forked_before_the_start_works():
     code = """
         import os, warnings
@@ -133,6 +134,46 @@ def test_a_child_forked_before_the_start_works():
         print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
     """
     assert printed(code) == "0"
+
+
+LOADER = """
+    import torch, diffpoint as dp
+    from torch.utils.data import DataLoader, Dataset
+
+    class Distances(Dataset):
+        def __len__(self):
+            return 4
+
+        def __getitem__(self, i):
+            return dp.nearest(torch.zeros(4, 3), torch.full((5, 3), float(i))).squared_distance
+
+    if __name__ == "__main__":
+        Distances()[0]  # an op before the workers start: what a training program does
+        loader = DataLoader(Distances(), num_workers=1, multiprocessing_context="METHOD")
+        print(torch.cat(list(loader))[:, 0].tolist())
+"""
+
+
+def load(tmp_path: Path, method: str) -> subprocess.CompletedProcess[str]:
+    program = tmp_path / "program.py"  # spawned workers import it
+    program.write_text(textwrap.dedent(LOADER).replace("METHOD", method))
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    command = [sys.executable, "-W", "ignore::DeprecationWarning", str(program)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_forked_loader_workers_tell_the_user_what_to_do(tmp_path):
+    done = load(tmp_path, "fork")
+    assert done.returncode == 1
+    assert "RuntimeError: diffpoint: this process was forked after Taichi had started" in done.stderr
+    assert "multiprocessing_context='spawn'" in done.stderr
+
+
+def test_spawned_loader_workers_work(tmp_path):
+    done = load(tmp_path, "spawn")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[0.0, 3.0, 12.0, 27.0]"
 
 
 def test_four_python_threads_at_once():
