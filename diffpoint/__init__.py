@@ -17,6 +17,7 @@ from diffpoint.softmatch import approxmatch
 from diffpoint.splat import Splat, splat_depth
 from diffpoint.transport import Transport, earth_mover_distance
 from diffpoint.views import ViewSample, sample_view
+from diffpoint.visibility import visible_points
 
 __version__ = "0.1.0"
 
@@ -49,4 +50,5 @@ __all__ = [
     "sample_view",
     "splat_depth",
     "unproject",
+    "visible_points",
 ]

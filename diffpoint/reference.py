@@ -128,6 +128,148 @@ def sample_view(points: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor
     return torch.where((index >= 0)[..., None], gathered, 0.0), index, lengths
 
 
+def visible_points(
+    points: Tensor,
+    K: Tensor,
+    cam_from_world: Tensor,
+    size: tuple[int, int],
+    *,
+    method: str,
+    radius: float,
+    tolerance: float,
+    lengths: Tensor | None = None,
+    filters: Tensor | None = None,
+) -> Tensor:
+    """(B, V, N): the tests of visibility one view after the other; `filters` (16, 11) and a score for "horizon"."""
+    batch, views = cam_from_world.shape[:2]
+    visible = torch.zeros((batch, views, points.shape[1]), dtype=torch.bool)
+    for b, v in itertools.product(range(batch), range(views)):
+        image, framed = image_positions(points[b], K[b, v], cam_from_world[b, v], size)
+        if lengths is not None:
+            framed = framed & (torch.arange(len(framed)) < lengths[b])
+        chosen = framed.nonzero()[:, 0]
+        if len(chosen) == 0:
+            continue
+        aspect = float(K[b, v, 0, 0] / K[b, v, 1, 1])
+        image = image[chosen]
+        spacing = point_spacing(image, aspect)
+        if method == "horizon":
+            assert filters is not None
+            horizon, open_ = horizons(image, aspect, spacing, radius)
+            seen = open_[horizon_score(horizon, filters) <= tolerance]
+        else:
+            seen = _seen_on_map(image, size, method, radius * spacing, tolerance, spacing)
+        visible[b, v, chosen[seen]] = True
+    return visible
+
+
+def image_positions(
+    points: Tensor, K: Tensor, cam_from_world: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """(u, v, focal length * log(depth)) (N, 3), all in pixels, and which of the points are in the frame (N,)."""
+    pixels, depth = (x[0, 0] for x in project(points[None], K[None, None], cam_from_world[None, None]))
+    framed = (depth > 0) & (pixels >= 0).all(1) & (pixels[:, 0] < size[1]) & (pixels[:, 1] < size[0])
+    return torch.cat((pixels, K[0, 0] * torch.where(framed, depth, 1.0).log()[:, None]), dim=1), framed
+
+
+def point_spacing(image: Tensor, aspect: float) -> float:
+    """sqrt(area of the silhouette / points) in pixels, from the share of cells that the points occupy."""
+    count = len(image)
+    flat = image[:, :2] - image[:, :2].min(0).values
+    flat = flat * flat.new_tensor([1.0, aspect])
+    side = cell_side(flat, count / 2, count, 1e-6)
+    occupied = len(torch.unique((flat / side).long(), dim=0))
+    area = torch.tensor(occupied, dtype=torch.float64)
+    for _ in range(20):
+        area = occupied / (1 - (-count / area).exp())
+    return side * float(area / count) ** 0.5
+
+
+def cell_side(flat: Tensor, cells: float, longest: float, smallest: float) -> float:
+    """Side of the squares that cut the extent of (n, 2) into about `cells`, neither way into more than `longest`."""
+    across, down = flat.max(0).values.tolist()
+    return max((across * down / cells) ** 0.5, max(across, down) / longest, smallest)
+
+
+def _seen_on_map(
+    image: Tensor, size: tuple[int, int], method: str, reach: float, tolerance: float, spacing: float
+) -> Tensor:
+    height, width = size
+    column, row = image[:, 0].long(), image[:, 1].long()
+    w = image[:, 2]
+    apart = torch.maximum((column[:, None] - column).abs(), (row[:, None] - row).abs())
+    reach = min(int(reach + 0.5), max(height, width))
+    if method == "radius":
+        front = torch.where(apart <= reach, w, torch.inf).min(1).values
+        return w <= front + tolerance * spacing
+    nearest_here = torch.where(apart == 0, w, torch.inf).min(1).values
+    tied = (apart == 0) & (w == w[:, None])
+    first = tied.to(torch.uint8).argmax(1)
+    owner = (w == nearest_here) & (first == torch.arange(len(w)))
+    if method == "pyramid":
+        side = max(reach, 2)
+        same = (column[:, None] // side == column // side) & (row[:, None] // side == row // side)
+        return owner & (w <= torch.where(same, w, torch.inf).min(1).values + tolerance * spacing)
+    gap = w[:, None] - w
+    dx, dy = column - column[:, None], row - row[:, None]
+    before = owner & (gap > 0) & (apart <= max(reach, 1)) & (apart > 0)
+    cosine = torch.where(before, gap / (gap.square() + dx.square() + dy.square()).sqrt(), 0.0)
+    sector = octant(dx, dy)
+    closed = torch.stack([torch.where(sector == k, cosine, 0.0).max(1).values for k in range(8)])
+    return owner & (closed.sum(0) <= 8 * tolerance)
+
+
+def octant(dx: Tensor, dy: Tensor) -> Tensor:
+    """0 to 7 around the circle from +x to +y; half-open, so that every direction has one."""
+    circle = torch.tensor([0, 1, 3, 2, 7, 6, 4, 5])
+    return circle[4 * (dy < 0).long() + 2 * (dx < 0).long() + (dy.abs() > dx.abs()).long()]
+
+
+def horizons(
+    image: Tensor, aspect: float, spacing: float, radius: float, *, cell: float = 1.5, deep: float = 3.0
+) -> tuple[Tensor, Tensor]:
+    """Cosine to the view's axis of the highest neighbour in 8 sectors (m, 8), and the m points it is known of.
+
+    The cosine is negative where the highest neighbour is farther than the point, -1 where there is none. Points that
+    are enclosed (`deep` behind two opposite of the 8 cells around theirs) are hidden, and nobody's neighbours.
+    """
+    flat = (image[:, :2] - image[:, :2].min(0).values) * image.new_tensor([1.0, aspect])
+    open_ = (~_enclosed(flat, image[:, 2], spacing, cell, deep)).nonzero()[:, 0]
+    flat, w = flat[open_], image[open_, 2]
+    way = flat - flat[:, None]
+    gap = w[:, None] - w
+    distance = way.square().sum(-1)
+    whole = distance + gap.square()
+    cosine = gap / whole.clamp(min=1e-30).sqrt()
+    near = (distance <= (radius * spacing) ** 2) & (whole > 0)
+    sector = octant(way[..., 0], way[..., 1])
+    highest = [torch.where(near & (sector == k), cosine, -1.0).max(1).values for k in range(8)]
+    return torch.stack(highest, dim=1), open_
+
+
+def _enclosed(flat: Tensor, w: Tensor, spacing: float, cell: float, deep: float) -> Tensor:
+    side = cell_side(flat, 2 * len(flat), len(flat) / 2, cell * spacing)
+    column, row = (flat / side).long().unbind(1)
+    front = w.new_full((int(row.max()) + 3, int(column.max()) + 3), torch.inf)
+    front.view(-1).scatter_reduce_(0, (row + 1) * front.shape[1] + column + 1, w, "amin")
+    sides = ((0, 1), (1, 0), (1, 1), (1, -1))
+    pairs = [
+        torch.maximum(front[row + 1 + dy, column + 1 + dx], front[row + 1 - dy, column + 1 - dx])
+        for dy, dx in sides
+    ]
+    return w > torch.stack(pairs).min(0).values + deep * spacing
+
+
+def horizon_score(horizon: Tensor, filters: Tensor) -> Tensor:
+    """(m,) from horizons (m, 8) and filters (F, 11): each responds at the 8 rotations of the sectors.
+
+    A filter is 8 weights, a bias, and what the mean and the maximum of its responses count.
+    """
+    turned = torch.stack([horizon.roll(-k, 1) for k in range(8)])
+    response = torch.relu(turned @ filters[:, :8].T + filters[:, 8])
+    return response.mean(0) @ filters[:, 9] + response.amax(0) @ filters[:, 10]
+
+
 def nearest(
     a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:

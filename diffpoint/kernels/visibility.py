@@ -1,0 +1,505 @@
+"""Visibility of points without a mesh: tests on a depth map, and on the horizons of the points themselves.
+
+Image positions are (u, v, w): pixels, and w = focal length * log(depth), so that differences of all three are lengths
+in one unit, the pixel, wherever the object stands. w is +inf for points that are not in the frame.
+"""
+
+from types import SimpleNamespace
+
+from diffpoint.kernels._backend import ti
+
+FILTERS = 16
+"""Filters of the horizon test; each reads the 8 sectors from each of them in turn."""
+CELL, DEEP = 1.5, 3.0
+"""A point this many spacings behind two opposite of the 8 cells around its cell is hidden; cells have this side."""
+_LANES = 16  # points judged at once in the horizon test: one vector register
+
+
+def build(real):
+    reals = ti.types.ndarray(dtype=real, ndim=1)
+    integers = ti.types.ndarray(dtype=ti.i64, ndim=1)
+    small = ti.types.ndarray(dtype=ti.i32, ndim=1)
+    flags = ti.types.ndarray(dtype=ti.u8, ndim=1)
+
+    @ti.func
+    def place(
+        points: ti.template(),
+        projection: ti.template(),
+        image: ti.template(),
+        cells: ti.template(),
+        view,
+        cloud,
+        count,
+        length,
+        height,
+        width,
+    ):
+        """Fill `image`; returns focal lengths' ratio, spacing, low u, low v, extents of u and v, how many points."""
+        camera = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
+        across = ti.Vector([camera[0], camera[1], camera[2]])
+        down = ti.Vector([camera[4], camera[5], camera[6]])
+        forward = ti.Vector([camera[8], camera[9], camera[10]])
+        # K's skew and principal point lie along `forward`, so the products leave the focal lengths.
+        focal = across.cross(forward).norm()
+        aspect = focal / down.cross(forward).norm()
+        columns = ti.cast(width, real)
+        rows = ti.cast(height, real)
+        low_u, low_v = columns, rows
+        high_u, high_v = real(0.0), real(0.0)
+        inside = 0
+        for i in range(count):
+            x = points[(cloud * count + i) * 3]
+            y = points[(cloud * count + i) * 3 + 1]
+            z = points[(cloud * count + i) * 3 + 2]
+            d = camera[8] * x + camera[9] * y + camera[10] * z + camera[11]
+            u = (camera[0] * x + camera[1] * y + camera[2] * z + camera[3]) / d
+            v = (camera[4] * x + camera[5] * y + camera[6] * z + camera[7]) / d
+            seen = (i < length) & (d > 0) & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+            at = (view * count + i) * 3
+            image[at] = ti.select(seen, u, real(0.0))
+            image[at + 1] = ti.select(seen, v, real(0.0))
+            image[at + 2] = real(ti.math.inf)
+            if seen:
+                image[at + 2] = focal * ti.log(d)
+                low_u = ti.select(u < low_u, u, low_u)
+                low_v = ti.select(v < low_v, v, low_v)
+                high_u = ti.select(u > high_u, u, high_u)
+                high_v = ti.select(v > high_v, v, high_v)
+                inside += 1
+        extent_u = high_u - low_u
+        extent_v = (high_v - low_v) * aspect
+        spacing = real(1.0)
+        if inside > 0:
+            # Points thrown on a silhouette of A cells occupy A (1 - exp(-n / A)) of them: solved for A.
+            n = ti.cast(inside, real)
+            side = cell_side(extent_u, extent_v, n / real(2.0), n, real(1e-6))
+            per_side = real(1.0) / side
+            across_cells = ti.cast(extent_u * per_side, ti.i32) + 1
+            down_cells = ti.cast(extent_v * per_side, ti.i32) + 1
+            first = view * (8 * count + 32)
+            for c in range(first, first + across_cells * down_cells):
+                cells[c] = 0
+            for i in range(count):
+                at = (view * count + i) * 3
+                if image[at + 2] < real(ti.math.inf):
+                    column = ti.cast((image[at] - low_u) * per_side, ti.i32)
+                    row = ti.cast((image[at + 1] - low_v) * aspect * per_side, ti.i32)
+                    cells[first + row * across_cells + column] = 1
+            occupied = real(0.0)
+            for c in range(first, first + across_cells * down_cells):
+                occupied += ti.cast(cells[c], real)
+            area = occupied
+            for _ in range(20):
+                area = occupied / (real(1.0) - ti.exp(-n / area))
+            spacing = side * ti.sqrt(area / n)
+        return aspect, spacing, low_u, low_v, extent_u, extent_v, inside
+
+    @ti.func
+    def cell_side(extent_u, extent_v, cells, longest, smallest):
+        """Side of the square cells that cut the extents into about `cells`, and neither into more than `longest`."""
+        even = ti.sqrt(extent_u * extent_v / cells)
+        thin = ti.max(extent_u, extent_v) / longest
+        return ti.max(even, thin, smallest)
+
+    @ti.func
+    def nearest_map(
+        image: ti.template(), depth: ti.template(), owner: ti.template(), view, count, height, width
+    ):
+        """The z-buffer of w and its owners: the nearest wins, then the lowest index."""
+        pixels = height * width
+        for p in range(view * pixels, view * pixels + pixels):
+            depth[p] = real(ti.math.inf)
+        for p in range(view * pixels, view * pixels + pixels):
+            owner[p] = -1
+        for i in range(count):
+            at = (view * count + i) * 3
+            w = image[at + 2]
+            p = view * pixels + ti.cast(image[at + 1], ti.i32) * width + ti.cast(image[at], ti.i32)
+            if w < depth[p]:
+                depth[p] = w
+                owner[p] = i
+
+    @ti.kernel
+    def slab(
+        points: reals,
+        lengths: integers,
+        projection: reals,
+        image: reals,
+        cells: small,
+        depth: reals,
+        visible: flags,
+        views: ti.i32,
+        count: ti.i32,
+        height: ti.i32,
+        width: ti.i32,
+        radius: real,
+        tolerance: real,
+        spread: ti.i32,
+    ):
+        """Points at most `tolerance` behind the nearest point within `radius` of their pixel."""
+        for step in range(lengths.shape[0] * views * spread):
+            if step % spread == 0:
+                view = step // spread
+                cloud = view // views
+                length = ti.cast(lengths[cloud], ti.i32)
+                _, spacing, _, _, _, _, _ = place(
+                    points, projection, image, cells, view, cloud, count, length, height, width
+                )
+                pixels = height * width
+                for p in range(view * pixels, view * pixels + pixels):
+                    depth[p] = real(ti.math.inf)
+                reach = ti.min(ti.cast(radius * spacing + real(0.5), ti.i32), ti.max(height, width))
+                for i in range(count):
+                    at = (view * count + i) * 3
+                    w = image[at + 2]
+                    if w < real(ti.math.inf):
+                        column = ti.cast(image[at], ti.i32)
+                        row = ti.cast(image[at + 1], ti.i32)
+                        for r in range(ti.max(row - reach, 0), ti.min(row + reach + 1, height)):
+                            for c in range(ti.max(column - reach, 0), ti.min(column + reach + 1, width)):
+                                p = view * pixels + r * width + c
+                                depth[p] = ti.select(w < depth[p], w, depth[p])
+                for i in range(count):
+                    at = (view * count + i) * 3
+                    w = image[at + 2]
+                    p = view * pixels + ti.cast(image[at + 1], ti.i32) * width + ti.cast(image[at], ti.i32)
+                    kept = (w < real(ti.math.inf)) & (w <= depth[p] + tolerance * spacing)
+                    visible[view * count + i] = ti.cast(kept, ti.u8)
+
+    @ti.kernel
+    def pyramid(
+        points: reals,
+        lengths: integers,
+        projection: reals,
+        image: reals,
+        cells: small,
+        depth: reals,
+        owner: small,
+        coarse: reals,
+        visible: flags,
+        views: ti.i32,
+        count: ti.i32,
+        height: ti.i32,
+        width: ti.i32,
+        radius: real,
+        tolerance: real,
+        spread: ti.i32,
+    ):
+        """Owners of a pixel that lie at most `tolerance` behind the nearest of a block of pixels of side `radius`."""
+        for step in range(lengths.shape[0] * views * spread):
+            if step % spread == 0:
+                view = step // spread
+                cloud = view // views
+                length = ti.cast(lengths[cloud], ti.i32)
+                _, spacing, _, _, _, _, _ = place(
+                    points, projection, image, cells, view, cloud, count, length, height, width
+                )
+                nearest_map(image, depth, owner, view, count, height, width)
+                pixels = height * width
+                side = ti.max(ti.min(ti.cast(radius * spacing + real(0.5), ti.i32), ti.max(height, width)), 2)
+                across = (width + side - 1) // side
+                for b in range(view * pixels, view * pixels + pixels):
+                    coarse[b] = real(ti.math.inf)
+                for r in range(height):
+                    for c in range(width):
+                        w = depth[view * pixels + r * width + c]
+                        b = view * pixels + (r // side) * across + c // side
+                        coarse[b] = ti.select(w < coarse[b], w, coarse[b])
+                for i in range(view * count, view * count + count):
+                    visible[i] = ti.u8(0)
+                for r in range(height):
+                    for c in range(width):
+                        p = view * pixels + r * width + c
+                        b = view * pixels + (r // side) * across + c // side
+                        if (owner[p] >= 0) & (depth[p] <= coarse[b] + tolerance * spacing):
+                            visible[view * count + owner[p]] = ti.u8(1)
+
+    @ti.kernel
+    def cone(
+        points: reals,
+        lengths: integers,
+        projection: reals,
+        image: reals,
+        cells: small,
+        depth: reals,
+        owner: small,
+        visible: flags,
+        views: ti.i32,
+        count: ti.i32,
+        height: ti.i32,
+        width: ti.i32,
+        radius: real,
+        tolerance: real,
+        spread: ti.i32,
+    ):
+        """Owners of a pixel with at least 1 - `tolerance` of the half space before them open, in 8 sectors."""
+        for step in range(lengths.shape[0] * views * spread):
+            if step % spread == 0:
+                view = step // spread
+                cloud = view // views
+                length = ti.cast(lengths[cloud], ti.i32)
+                _, spacing, _, _, _, _, _ = place(
+                    points, projection, image, cells, view, cloud, count, length, height, width
+                )
+                nearest_map(image, depth, owner, view, count, height, width)
+                pixels = height * width
+                reach = ti.max(
+                    ti.min(ti.cast(radius * spacing + real(0.5), ti.i32), ti.max(height, width)), 1
+                )
+                for i in range(view * count, view * count + count):
+                    visible[i] = ti.u8(0)
+                for row in range(height):
+                    for column in range(width):
+                        own = view * pixels + row * width + column
+                        if owner[own] >= 0:
+                            closed = ti.Vector([real(0.0) for _ in ti.static(range(8))])
+                            for r in range(ti.max(row - reach, 0), ti.min(row + reach + 1, height)):
+                                for c in range(ti.max(column - reach, 0), ti.min(column + reach + 1, width)):
+                                    gap = depth[own] - depth[view * pixels + r * width + c]
+                                    if gap > 0:
+                                        dx = ti.cast(c - column, real)
+                                        dy = ti.cast(r - row, real)
+                                        cosine = gap / ti.sqrt(gap * gap + dx * dx + dy * dy)
+                                        sector = octant(dx, dy)
+                                        for k in ti.static(range(8)):
+                                            higher = (sector == k) & (cosine > closed[k])
+                                            closed[k] = ti.select(higher, cosine, closed[k])
+                            if closed.sum() <= tolerance * real(8.0):
+                                visible[view * count + owner[own]] = ti.u8(1)
+
+    @ti.func
+    def octant(dx, dy):
+        """0 to 7: signs of dy and dx, and which is larger. Half-open, so that every direction has one."""
+        return (
+            4 * ti.cast(dy < 0, ti.i32)
+            + 2 * ti.cast(dx < 0, ti.i32)
+            + ti.cast(ti.abs(dy) > ti.abs(dx), ti.i32)
+        )
+
+    @ti.func
+    def drop_enclosed(
+        image: ti.template(),
+        front: ti.template(),
+        view,
+        count,
+        inside,
+        low_u,
+        low_v,
+        extent_u,
+        extent_v,
+        aspect,
+        spacing,
+    ):
+        """Take out of the image what lies deep behind the cells on both sides of it; returns how many remain."""
+        n = ti.cast(inside, real)
+        side = cell_side(extent_u, extent_v, real(2.0) * n, n / real(2.0), real(CELL) * spacing)
+        per_side = real(1.0) / side
+        across = ti.cast(extent_u * per_side, ti.i32) + 3  # a ring of empty cells all around
+        down = ti.cast(extent_v * per_side, ti.i32) + 3
+        first = view * (8 * count + 32)
+        for c in range(first, first + across * down):
+            front[c] = real(ti.math.inf)
+        for i in range(count):
+            at = (view * count + i) * 3
+            w = image[at + 2]
+            if w < real(ti.math.inf):
+                column = ti.cast((image[at] - low_u) * per_side, ti.i32) + 1
+                row = ti.cast((image[at + 1] - low_v) * aspect * per_side, ti.i32) + 1
+                c = first + row * across + column
+                front[c] = ti.select(w < front[c], w, front[c])
+        remain = 0
+        for i in range(count):
+            at = (view * count + i) * 3
+            w = image[at + 2]
+            if w < real(ti.math.inf):
+                column = ti.cast((image[at] - low_u) * per_side, ti.i32) + 1
+                row = ti.cast((image[at + 1] - low_v) * aspect * per_side, ti.i32) + 1
+                c = first + row * across + column
+                level = ti.max(front[c - 1], front[c + 1])
+                level = ti.min(level, ti.max(front[c - across], front[c + across]))
+                level = ti.min(level, ti.max(front[c - across - 1], front[c + across + 1]))
+                level = ti.min(level, ti.max(front[c - across + 1], front[c + across - 1]))
+                enclosed = w > level + real(DEEP) * spacing
+                image[at + 2] = ti.select(enclosed, real(ti.math.inf), w)
+                remain += ti.select(enclosed, 0, 1)
+        return remain
+
+    @ti.func
+    def sort_into_cells(
+        image: ti.template(),
+        cells: ti.template(),
+        order: ti.template(),
+        packed: ti.template(),
+        view,
+        count,
+        low_u,
+        low_v,
+        aspect,
+        per_side,
+        across,
+        down,
+    ):
+        """Counting sort: `packed` holds the points of the frame cell by cell, `cells` where each cell ends."""
+        first = view * (8 * count + 32)
+        for c in range(first, first + across * down + 1):
+            cells[c] = 0
+        for i in range(count):
+            at = (view * count + i) * 3
+            if image[at + 2] < real(ti.math.inf):
+                column = ti.cast((image[at] - low_u) * per_side, ti.i32)
+                row = ti.cast((image[at + 1] - low_v) * aspect * per_side, ti.i32)
+                cells[first + row * across + column + 1] += 1
+        for c in range(first, first + across * down):
+            cells[c + 1] += cells[c]
+        for i in range(count):
+            at = (view * count + i) * 3
+            if image[at + 2] < real(ti.math.inf):
+                column = ti.cast((image[at] - low_u) * per_side, ti.i32)
+                row = ti.cast((image[at + 1] - low_v) * aspect * per_side, ti.i32)
+                c = first + row * across + column
+                slot = view * count + cells[c]
+                cells[c] += 1
+                order[slot] = i
+                packed[slot * 3] = image[at] - low_u
+                packed[slot * 3 + 1] = (image[at + 1] - low_v) * aspect
+                packed[slot * 3 + 2] = image[at + 2]
+
+    @ti.kernel
+    def horizon(
+        points: reals,
+        lengths: integers,
+        projection: reals,
+        image: reals,
+        cells: small,
+        front: reals,
+        order: small,
+        packed: reals,
+        filters: reals,
+        visible: flags,
+        views: ti.i32,
+        count: ti.i32,
+        height: ti.i32,
+        width: ti.i32,
+        radius: real,
+        limit: real,
+        spread: ti.i32,
+    ):
+        """Points whose 8 horizons within `radius` score at most `limit` under the filters."""
+        for step in range(lengths.shape[0] * views * spread):
+            if step % spread == 0:
+                view = step // spread
+                cloud = view // views
+                length = ti.cast(lengths[cloud], ti.i32)
+                aspect, spacing, low_u, low_v, extent_u, extent_v, inside = place(
+                    points, projection, image, cells, view, cloud, count, length, height, width
+                )
+                for i in range(view * count, view * count + count):
+                    visible[i] = ti.u8(0)
+                inside = drop_enclosed(
+                    image, front, view, count, inside, low_u, low_v, extent_u, extent_v, aspect, spacing
+                )
+                n = ti.cast(inside, real)
+                reach = radius * spacing
+                side = cell_side(extent_u, extent_v, real(2.0) * n, n, reach / real(2.0))
+                per_side = real(1.0) / side
+                across = ti.cast(extent_u * per_side, ti.i32) + 1
+                down = ti.cast(extent_v * per_side, ti.i32) + 1
+                if inside > 0:
+                    sort_into_cells(
+                        image, cells, order, packed, view, count, low_u, low_v, aspect, per_side, across, down
+                    )
+                last = view * count + inside - 1
+                for tile in range((inside + _LANES - 1) // _LANES):
+                    begin = view * count + tile * _LANES
+                    x = ti.Vector([packed[ti.min(begin + s, last) * 3] for s in ti.static(range(_LANES))])
+                    y = ti.Vector([packed[ti.min(begin + s, last) * 3 + 1] for s in ti.static(range(_LANES))])
+                    w = ti.Vector([packed[ti.min(begin + s, last) * 3 + 2] for s in ti.static(range(_LANES))])
+                    # Eight vectors by name: a matrix would not stay in registers.
+                    none = ti.Vector([real(-1.0) for _ in ti.static(range(_LANES))])
+                    c0, c1, c2, c3, c4, c5, c6, c7 = none, none, none, none, none, none, none, none
+                    left = ti.max(ti.cast((x.min() - reach) * per_side, ti.i32), 0)
+                    right = ti.min(ti.cast((x.max() + reach) * per_side, ti.i32), across - 1)
+                    top = ti.max(ti.cast((y.min() - reach) * per_side, ti.i32), 0)
+                    bottom = ti.min(ti.cast((y.max() + reach) * per_side, ti.i32), down - 1)
+                    for row in range(top, bottom + 1):
+                        # After the sort cells[c] is where cell c ends, hence where c + 1 begins.
+                        row_first = view * (8 * count + 32) + row * across
+                        start = 0
+                        if row_first + left > view * (8 * count + 32):
+                            start = cells[row_first + left - 1]
+                        for j in range(view * count + start, view * count + cells[row_first + right]):
+                            dx = packed[j * 3] - x
+                            dy = packed[j * 3 + 1] - y
+                            gap = w - packed[j * 3 + 2]
+                            d = dx * dx + dy * dy
+                            whole = d + gap * gap
+                            near = (d <= reach * reach) & (whole > 0)
+                            # Squared cosine between the view's axis and the way to the neighbour, signed.
+                            rise = gap * ti.abs(gap) / ti.max(whole, real(1e-30))
+                            rise = ti.select(near, rise, real(-1.0))
+                            sector = octant(dx, dy)
+                            c0 = raised(c0, rise, sector == 0)
+                            c1 = raised(c1, rise, sector == 1)
+                            c2 = raised(c2, rise, sector == 3)
+                            c3 = raised(c3, rise, sector == 2)
+                            c4 = raised(c4, rise, sector == 6)
+                            c5 = raised(c5, rise, sector == 7)
+                            c6 = raised(c6, rise, sector == 5)
+                            c7 = raised(c7, rise, sector == 4)
+                    score = judge(filters, c0, c1, c2, c3, c4, c5, c6, c7)
+                    for s in ti.static(range(_LANES)):
+                        if begin + s <= last:
+                            visible[view * count + order[begin + s]] = ti.cast(score[s] <= limit, ti.u8)
+
+    @ti.func
+    def raised(horizon, rise, here):
+        value = ti.select(here, rise, real(-1.0))
+        return ti.select(value > horizon, value, horizon)
+
+    @ti.func
+    def judge(filters: ti.template(), c0, c1, c2, c3, c4, c5, c6, c7):
+        """Filters of 8 weights, a bias, and what their mean and their maximum over the 8 rotations count."""
+        h0, h1, h2, h3 = signed_root(c0), signed_root(c1), signed_root(c2), signed_root(c3)
+        h4, h5, h6, h7 = signed_root(c4), signed_root(c5), signed_root(c6), signed_root(c7)
+        score = h0 * real(0.0)
+        for f in range(FILTERS):
+            a = ti.Vector([filters[f * 11 + e] for e in ti.static(range(11))])
+            r = response(a, h0, h1, h2, h3, h4, h5, h6, h7)
+            total, largest = r, r
+            r = response(a, h1, h2, h3, h4, h5, h6, h7, h0)
+            total, largest = total + r, ti.select(r > largest, r, largest)
+            r = response(a, h2, h3, h4, h5, h6, h7, h0, h1)
+            total, largest = total + r, ti.select(r > largest, r, largest)
+            r = response(a, h3, h4, h5, h6, h7, h0, h1, h2)
+            total, largest = total + r, ti.select(r > largest, r, largest)
+            r = response(a, h4, h5, h6, h7, h0, h1, h2, h3)
+            total, largest = total + r, ti.select(r > largest, r, largest)
+            r = response(a, h5, h6, h7, h0, h1, h2, h3, h4)
+            total, largest = total + r, ti.select(r > largest, r, largest)
+            r = response(a, h6, h7, h0, h1, h2, h3, h4, h5)
+            total, largest = total + r, ti.select(r > largest, r, largest)
+            r = response(a, h7, h0, h1, h2, h3, h4, h5, h6)
+            total, largest = total + r, ti.select(r > largest, r, largest)
+            score += a[9] * total / real(8.0) + a[10] * largest
+        return score
+
+    @ti.func
+    def signed_root(c):
+        return ti.select(c < 0, -ti.sqrt(ti.abs(c)), ti.sqrt(ti.abs(c)))
+
+    @ti.func
+    def response(a, h0, h1, h2, h3, h4, h5, h6, h7):
+        r = (
+            a[0] * h0
+            + a[1] * h1
+            + a[2] * h2
+            + a[3] * h3
+            + a[4] * h4
+            + a[5] * h5
+            + a[6] * h6
+            + a[7] * h7
+            + a[8]
+        )
+        return ti.select(r > 0, r, real(0.0))
+
+    return SimpleNamespace(slab=slab, pyramid=pyramid, cone=cone, horizon=horizon)
