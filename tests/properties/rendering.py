@@ -165,6 +165,31 @@ def _assert_projected(ours: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]
         assert_within(ours[0][..., axis][certain], theirs[0][..., axis][certain], 2 * error[certain])
 
 
+def check_visible_points(case: Rendering, method: str) -> str:
+    """The methods are estimates, and their own tests judge those; here: what holds for each of them, for any cloud."""
+    cloud, camera = case.recipe.make(), case.camera.make(case.recipe.dtype)
+
+    def visible() -> Tensor:
+        return dp.visible_points(cloud.points, camera, method=method, lengths=cloud.lengths)
+
+    names = ("visible_points", "splat_depth")
+    seen = refuse_or_run(visible, cloud.poisoned, *names)
+    if seen is None:
+        return REFUSED
+    matrices = twins_camera(camera, len(cloud.points))
+    at = image_bounds(cloud.clean, *matrices)
+    inside = torch.arange(case.recipe.count) < cloud.counts[:, None]
+    assert seen.shape == at.depth.shape
+    assert not (seen & ~inside[:, None]).any()
+    outside = (at.u + at.u_error < 0) | (at.u - at.u_error > camera.width) | (at.depth + at.depth_error < 0)
+    outside |= (at.v + at.v_error < 0) | (at.v - at.v_error > camera.height)
+    assert not (seen & outside).any()
+    assert torch.equal(seen, visible())
+    if method == "zbuffer":
+        assert torch.equal(seen, dp.splat_depth(cloud.points, camera, lengths=cloud.lengths).visible)
+    return AGREED
+
+
 class Maps(NamedTuple):
     recipe: throw.Recipe
     camera: throw.CameraRecipe
