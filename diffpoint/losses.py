@@ -21,6 +21,7 @@ from diffpoint.reproject import check_depth, unproject
 from diffpoint.splat import splat_depth
 from diffpoint.transport import earth_mover_distance
 from diffpoint.views import sample_view
+from diffpoint.visibility import Method, visible_points
 
 Reduction = Literal["mean", "none"]
 
@@ -40,18 +41,21 @@ class FrontSets(NamedTuple):
     """(B, V) bool: no predicted point was visible, so the whole cloud stands in and is pulled into view."""
 
 
-def front_sets(points: Tensor, camera: PinholeCamera, depth: Tensor) -> FrontSets:
+def front_sets(
+    points: Tensor, camera: PinholeCamera, depth: Tensor, *, visibility: Method = "zbuffer"
+) -> FrontSets:
     """The two point sets that the front constraint compares, for every view.
 
     Args:
         points: (B, N, 3) predicted clouds in the world.
         camera: batch shape (), (V,) or (B, V), of the depth maps' size.
         depth: (B, V, H, W) true depth maps, +inf where empty.
+        visibility: how the predicted points that a view sees are found; a method of `visible_points`.
 
     Gradients: of `predicted` to x, y and z of the visible points; of `observed` to `depth` and the camera.
 
     Raises:
-        ValueError, TypeError: as `splat_depth` and `unproject`.
+        ValueError, TypeError: as `visible_points` and `unproject`.
 
     Example:
         >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
@@ -61,7 +65,7 @@ def front_sets(points: Tensor, camera: PinholeCamera, depth: Tensor) -> FrontSet
         ([[1]], [[1]])
     """
     batch, views = _check_maps("front_sets", points, camera, depth)
-    sample = sample_view(points, splat_depth(points, camera))
+    sample = sample_view(points, visible_points(points, camera, method=visibility))
     seen = sample.points.expand(batch, views, -1, 3)
     lengths = sample.lengths.expand(batch, views)
     fallback = lengths == 0
@@ -82,6 +86,7 @@ def front_constraint(
     *,
     distance: Literal["chamfer", "emd"] = "chamfer",
     tolerance: float = 0.02,
+    visibility: Method = "zbuffer",
     reduction: Reduction = "mean",
 ) -> Tensor:
     """distance(points that each view sees, points of its true depth map), in 3D.
@@ -92,6 +97,8 @@ def front_constraint(
         depth: (B, V, H, W) true depth maps, +inf where empty.
         distance: "chamfer": sum of both directions' mean distances; "emd": mean distance of the assignment.
         tolerance: of the earth mover's distance.
+        visibility: how the points that a view sees are found: "zbuffer" is the paper's; "horizon" passes on more of
+            the visible points and fewer of the hidden ones. See `visible_points`.
         reduction: "mean" over all views, or "none" for (B, V).
 
     Returns:
@@ -115,7 +122,7 @@ def front_constraint(
         True
     """
     _checks.check_choice("front_constraint", "distance", distance, ("chamfer", "emd"))
-    sets = front_sets(points, camera, depth)
+    sets = front_sets(points, camera, depth, visibility=visibility)
     if points.shape[1] == 0:
         raise _checks.fail("front_constraint", "points", "hold at least one point", str(tuple(points.shape)))
     empty = sets.observed_lengths == 0

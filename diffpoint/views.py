@@ -23,12 +23,12 @@ class ViewSample(NamedTuple):
     """(B, V) int64."""
 
 
-def sample_view(points: Tensor, splat: Splat) -> ViewSample:
-    """Gather the points that own a pixel of each view.
+def sample_view(points: Tensor, splat: Splat | Tensor) -> ViewSample:
+    """Gather the points that each view sees: with `splat_depth`, those that own a pixel of it.
 
     Args:
         points: (B, N, 3) in the world, those that `splat` was rendered from.
-        splat: the result of `splat_depth`.
+        splat: the result of `splat_depth`, or that of `visible_points`: (B, V, N) bool.
 
     Returns:
         `ViewSample`; a view that no point falls into has length 0.
@@ -49,11 +49,16 @@ def sample_view(points: Tensor, splat: Splat) -> ViewSample:
         [[[1]]]
     """
     _checks.check_clouds("sample_view", "points", points)
-    if not isinstance(splat, Splat):
+    visible = splat.visible if isinstance(splat, Splat) else splat
+    if not isinstance(visible, Tensor) or visible.dtype != torch.bool:
+        what = f"a tensor of {visible.dtype}" if isinstance(visible, Tensor) else type(splat).__name__
         raise TypeError(
-            f"sample_view: 'splat' must be the result of splat_depth; got {type(splat).__name__}."
+            "sample_view: 'splat' must be the result of splat_depth, or of visible_points (a bool tensor); "
+            f"got {what}."
         )
-    batch, _, count = splat.visible.shape
+    _checks.check_device("sample_view", "splat", visible)
+    _checks.check_shape("sample_view", "splat", visible, ("B", "V", "N"))
+    batch, _, count = visible.shape
     if (batch, count) != tuple(points.shape[:2]):
         raise _checks.fail(
             "sample_view",
@@ -62,7 +67,7 @@ def sample_view(points: Tensor, splat: Splat) -> ViewSample:
             str(tuple(points.shape)),
             "Pass the cloud that splat_depth rendered.",
         )
-    return ViewSample(*_sample_view(points, splat.visible))
+    return ViewSample(*_sample_view(points, visible))
 
 
 def _sample_fake(points: Tensor, visible: Tensor):

@@ -188,3 +188,38 @@ def test_mistakes_are_named(arguments, message):
     arguments = {"method": "horizon", **arguments}
     with pytest.raises(ValueError, match=message):
         dp.visible_points(spheres(5, torch.float32), cameras(torch.float32), **arguments)
+
+
+def test_sample_view_and_the_front_constraint_take_any_visibility():
+    camera = cameras(torch.float32)
+    points = spheres(300, torch.float32).requires_grad_()
+    visible = dp.visible_points(points, camera, method="horizon")
+    sample = dp.sample_view(points, visible)
+    assert torch.equal(sample.lengths, visible.sum(-1))
+    assert torch.equal(sample.points[1, 0, : sample.lengths[1, 0]], points[1, visible[1, 0]])
+    (gradient,) = torch.autograd.grad(sample.points.sum(), points)
+    assert torch.equal(gradient[..., 0], visible.sum(1).float())
+    from_splat = dp.sample_view(points, dp.splat_depth(points, camera))
+    from_flags = dp.sample_view(points, dp.visible_points(points, camera))
+    assert torch.equal(from_splat.index, from_flags.index)
+
+    truth = dp.splat_depth(0.9 * spheres(4000, torch.float32, seed=1), camera).depth
+    sets = dp.front_sets(points, camera, truth, visibility="horizon")
+    assert torch.equal(sets.predicted_lengths, visible.sum(-1))
+    paper, better = (
+        dp.front_constraint(points, camera, truth, visibility=v).item() for v in ("zbuffer", "horizon")
+    )
+    assert paper == dp.front_constraint(points, camera, truth).item()
+    assert better < paper  # the far side, which the z-buffer lets through, is far from the truth
+
+
+def test_sample_view_refuses_flags_that_are_none():
+    points = spheres(10, torch.float32)
+    with pytest.raises(
+        TypeError, match=r"or of visible_points \(a bool tensor\); got a tensor of torch.float32"
+    ):
+        dp.sample_view(points, torch.ones(2, 1, 10))
+    with pytest.raises(ValueError, match=r"'splat' must have shape \(B, V, N\)"):
+        dp.sample_view(points, torch.ones(2, 10, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"'points' must have shape \(2, 9, 3\) to match 'splat'"):
+        dp.sample_view(points, torch.ones(2, 1, 9, dtype=torch.bool))
