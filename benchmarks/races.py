@@ -332,7 +332,7 @@ def _farthest(count: int, n: int, k: int) -> Iterator[Race]:
             Contender(
                 "fpsample plain",
                 lambda: _each(count, lambda i: fpsample.fps_sampling(numpy_points[i], k, start_idx=0)),
-                lambda r: torch.from_numpy(np.stack([x.astype(np.int64) for x in r])),
+                remark="another order",
             )
         )
 

@@ -29,8 +29,9 @@ def build(real):
                     u = real(ti.math.inf)
                     v = real(ti.math.inf)
                     if d > 0:
-                        u = (m[0] * x + m[1] * y + m[2] * z + m[3]) / d
-                        v = (m[4] * x + m[5] * y + m[6] * z + m[7]) / d
+                        inverse = real(1.0) / d  # as in the splat, so that both put a point in the same pixel
+                        u = (m[0] * x + m[1] * y + m[2] * z + m[3]) * inverse
+                        v = (m[4] * x + m[5] * y + m[6] * z + m[7]) * inverse
                     pixels[view, i, 0] = u
                     pixels[view, i, 1] = v
                     depth[view, i] = d

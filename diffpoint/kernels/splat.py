@@ -36,8 +36,9 @@ def build(real):
         y = points[offset + 1]
         z = points[offset + 2]
         d = camera[8] * x + camera[9] * y + camera[10] * z + camera[11]
-        u = (camera[0] * x + camera[1] * y + camera[2] * z + camera[3]) / d
-        v = (camera[4] * x + camera[5] * y + camera[6] * z + camera[7]) / d
+        inverse = real(1.0) / d
+        u = (camera[0] * x + camera[1] * y + camera[2] * z + camera[3]) * inverse
+        v = (camera[4] * x + camera[5] * y + camera[6] * z + camera[7]) * inverse
         return u, v, d
 
     @ti.kernel
@@ -67,7 +68,7 @@ def build(real):
                 for i in range(ti.cast(lengths[cloud], ti.i32)):
                     u, v, d = image_position(points, camera, (cloud * count + i) * 3)
                     # Bitwise "and", and a select for the winner: both choices are cheaper than a missed branch.
-                    if (d > 0) & (u >= 0) & (u < columns) & (v >= 0) & (v < rows):
+                    if (d > real(0.0)) & (u >= real(0.0)) & (u < columns) & (v >= real(0.0)) & (v < rows):
                         p = view * pixels + ti.cast(v, ti.i32) * width + ti.cast(u, ti.i32)
                         wins = d < depth[p]
                         depth[p] = ti.select(wins, d, depth[p])
