@@ -1,11 +1,11 @@
-# make demo | test | check | bench | clean. Each installs what it needs into .venv first.
+# make demo | test | check | bench | docs | clean. Each installs what it needs into .venv first.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # torch's OpenMP threads would otherwise spin after each op and slow the next kernel.
 export OMP_WAIT_POLICY := passive
 
-.PHONY: demo test slow check bench clean
+.PHONY: demo test slow check bench docs clean
 .DEFAULT_GOAL := test
 
 $(VENV)/installed: pyproject.toml constraints.txt
@@ -33,5 +33,10 @@ check: $(VENV)/installed
 bench: $(VENV)/installed
 	$(BIN)/python -m benchmarks
 
+docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(BIN)/python -m sphinx -q -W --keep-going docs docs/_build
+	@echo "open docs/_build/index.html"
+
 clean:
-	rm -rf $(VENV) dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) docs/_build dist .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,98 @@
+"""What the pages promise runs as it stands: the README, also from an installed wheel, and the tables of the docs."""
+
+from __future__ import annotations
+
+import doctest
+import re
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+import diffpoint
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+
+
+def python_blocks(page: Path) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def readme_example() -> str:
+    (example,) = python_blocks(ROOT / "README.md")
+    return example
+
+
+def test_the_readmes_example_runs():
+    results: dict[str, object] = {}
+    exec(compile(readme_example(), "README.md", "exec"), results)
+    assert results["points"].grad.abs().sum() > 0
+    assert 0 < results["cost"].item() < 1
+
+
+@pytest.mark.parametrize(
+    "page", [p for p in PAGES if ">>>" in p.read_text(encoding="utf-8")], ids=lambda p: p.stem
+)
+def test_a_pages_examples_print_what_they_say(page):
+    failed, tried = doctest.testfile(
+        str(page), module_relative=False, optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
+    )
+    assert tried > 0
+    assert failed == 0
+
+
+def test_every_public_name_has_its_place_in_the_reference():
+    reference = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs/reference").glob("*.md"))
+    placed = set(re.findall(r"^\.\. auto(?:function|class):: (\w+)$", reference, re.MULTILINE))
+    assert placed == set(diffpoint.__all__)
+
+
+@pytest.mark.slow
+def test_the_docs_build_without_a_warning(tmp_path):
+    pytest.importorskip("sphinx", reason="the extra [docs] is not installed")
+    build = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", str(ROOT / "docs"), str(tmp_path)]
+    done = subprocess.run(build, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "each a mean over its own set" in (tmp_path / "reference/distances.html").read_text(
+        encoding="utf-8"
+    )
+
+
+@pytest.mark.slow
+def test_the_wheel_runs_the_readmes_example_in_an_empty_environment(tmp_path):
+    """Only the wheel is installed there; torch, taichi and numpy are lent, behind it on the path."""
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(ROOT)]
+    subprocess.run(build, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    empty = tmp_path / "venv"
+    venv.create(empty, with_pip=False)
+    python = empty / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+    ask = [str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
+    site_packages = Path(subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip())
+    install = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        str(python),
+        "install",
+        "--no-deps",
+        "--no-index",
+        str(wheel),
+    ]
+    subprocess.run(install, check=True, capture_output=True)
+    # A plain line in a .pth file is appended to the path, so that nothing lent hides what was installed.
+    (site_packages / "lent.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    script = tmp_path / "example.py"
+    script.write_text(readme_example() + "\nprint(dp.__file__)\nprint(cost.item() > 0)\n")
+    done = subprocess.run(
+        [str(python), "-E", str(script)], capture_output=True, text=True, cwd=tmp_path, timeout=240
+    )
+    assert done.returncode == 0, done.stderr
+    imported, positive = done.stdout.split()
+    assert Path(imported).is_relative_to(site_packages)
+    assert positive == "True"
