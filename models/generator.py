@@ -264,8 +264,7 @@ def _initialise(model: Generator) -> None:
     """Keeps the second moment of activations through the layers, and starts clouds small, around the origin.
 
     A layer followed by a ReLU gets variance 2 / fan-in. The layers whose outputs are summed before one ReLU
-    get half of it. With the defaults of torch the signal of the image fades through the trunk's eleven
-    layers.
+    get half of it. With the defaults of torch the signal of the image fades through the trunk's eleven layers.
     """
     decoder = model.decoder
     summed = {decoder.up5, decoder.skip5, decoder.up4, decoder.skip4, decoder.skip3}

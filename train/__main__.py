@@ -18,8 +18,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from .config import PROFILES, FitConfig, fit_config_from_json
-from .errors import UserError
+from train.config import PROFILES, FitConfig, fit_config_from_json
+from train.errors import UserError
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
 
@@ -42,7 +42,7 @@ class Procedural:
     """Views per shape."""
 
     def run(self) -> None:
-        from .data.procedural import generate
+        from train.data.procedural import generate
 
         report = generate(
             self.out,
@@ -57,8 +57,7 @@ class Procedural:
 
 @dataclasses.dataclass
 class Meshes:
-    """Render meshes into a data tree: OBJ, GLB, PLY or OFF in folders, zips, .sh3f libraries or ShapeNet
-    trees."""
+    """Render meshes into a data tree: OBJ, GLB, PLY or OFF in folders, zips, .sh3f libraries or ShapeNet trees."""
 
     sources: Positional[tuple[Path, ...]]
     """Mesh files, folders, zips or .sh3f libraries."""
@@ -74,7 +73,7 @@ class Meshes:
     """Seeds cameras, surface samples and the split."""
 
     def run(self) -> None:
-        from .data.meshes import convert
+        from train.data.meshes import convert
 
         report = convert(
             self.sources, self.out, labels=self.labels, size=self.size, views=self.views, seed=self.seed
@@ -90,7 +89,7 @@ class Check:
     """Root of the data tree."""
 
     def run(self) -> None:
-        from .data.check import check_tree
+        from train.data.check import check_tree
 
         print(check_tree(self.data).summary())
 
@@ -127,7 +126,7 @@ class Fit:
     """The same number of steps for both stages, for a quick trial."""
 
     def run(self) -> int:
-        from .fit import fit
+        from train.fit import fit
 
         config = self.config
         if self.steps is not None:
@@ -166,7 +165,7 @@ class Reconstruct:
     """Draws the codes."""
 
     def run(self) -> None:
-        from .reconstruction import reconstruct_to_files
+        from train.reconstruction import reconstruct_to_files
 
         reconstruct_to_files(
             self.model, self.images, self.out, groups=self.groups, steps=self.steps, seed=self.seed
@@ -193,7 +192,7 @@ class Evaluate:
     """Where to write; RUN/evaluation.json if not given."""
 
     def run(self) -> None:
-        from .evaluate import evaluate
+        from train.evaluate import evaluate
 
         evaluate(
             self.model,
@@ -208,14 +207,13 @@ class Evaluate:
 
 @dataclasses.dataclass
 class Demo:
-    """The whole chain on generated shapes: data, training, evaluation, reconstruction, and a page that shows
-    it."""
+    """The whole chain on generated shapes: data, training, evaluation, reconstruction, and a page that shows it."""
 
     out: Path = Path("demo")
     """Directory to write to; ends with report.html."""
 
     def run(self) -> None:
-        from .demo import demo
+        from train.demo import demo
 
         demo(self.out)
 

@@ -22,9 +22,8 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from diffpoint import PinholeCamera
-
-from .data import ShapeTree
-from .errors import UserError
+from train.data import ShapeTree
+from train.errors import UserError
 
 
 class SmallDepth(NamedTuple):

@@ -19,10 +19,9 @@ from safetensors.torch import save_file
 from torch import nn
 
 from models import Generator, GeneratorConfig, build_generator
-
-from .config import PROFILES, FitConfig, fit_config_from_json
-from .errors import UserError
-from .files import remove, replacing
+from train.config import PROFILES, FitConfig, fit_config_from_json
+from train.errors import UserError
+from train.files import remove, replacing
 
 _HEADER = "diffpoint.generator"
 _KEPT = 2

@@ -14,7 +14,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from .errors import UserError
+from train.errors import UserError
 
 Profile = Literal["full", "cpu", "smoke"]
 
@@ -50,8 +50,7 @@ class StageConfig:
     diversity_stride: int
     """Every how many-th point of a cloud takes part in the diversity loss, in turns."""
     ramp: tuple[int, int]
-    """Steps between which the diversity weight rises from 0 to beta: the image has to speak before the
-    codes."""
+    """Steps between which the diversity weight rises from 0 to beta: the image has to speak before the codes."""
     select: Literal["cd", "fps_cd"]
     """Validation figure by which the stage's best checkpoint is chosen."""
     learning_rate: float = 1e-4

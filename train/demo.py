@@ -1,5 +1,4 @@
-"""The demo: data, training, evaluation, reconstruction and a report, through the functions of the
-commands."""
+"""The demo: data, training, evaluation, reconstruction and a report, through the functions of the commands."""
 
 from __future__ import annotations
 
@@ -9,16 +8,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from .checkpoint import best_weights
-from .config import PROFILES, FitConfig, scaled
-from .data import ShapeTree
-from .data.procedural import generate
-from .data.store import render_folder
-from .evaluate import evaluate
-from .files import write_text
-from .fit import fit
-from .reconstruction import reconstruct_to_files
-from .report import write_report
+from train.checkpoint import best_weights
+from train.config import PROFILES, FitConfig, scaled
+from train.data import ShapeTree
+from train.data.procedural import generate
+from train.data.store import render_folder
+from train.evaluate import evaluate
+from train.files import write_text
+from train.fit import fit
+from train.reconstruction import reconstruct_to_files
+from train.report import write_report
 
 # Two fifths of the profile's steps: about six minutes on two cores, and past the point where more views help.
 DEMO_CONFIG = scaled(PROFILES["cpu"], 0.4)

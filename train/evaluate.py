@@ -1,7 +1,6 @@
 """How good a run is on shapes it has never seen, beside two answers that need no network.
 
-All distances are un-squared and x100. `evaluation.json` keeps every figure with the configuration that made
-it.
+All distances are un-squared and x100. `evaluation.json` keeps every figure with the configuration that made it.
 """
 
 from __future__ import annotations
@@ -18,17 +17,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from models import Generator
-
-from .batches import LoadedSplit, load_split
-from .checkpoint import config_of, load_generator
-from .config import FitConfig
-from .errors import UserError
-from .files import write_text
-from .health import sensitivity
-from .inference import reconstruct
-from .metrics import cloud_errors, thin_out
-from .table import format_table
-from .trivial import medoid, nearest_by_image
+from train.batches import LoadedSplit, load_split
+from train.checkpoint import config_of, load_generator
+from train.config import FitConfig
+from train.errors import UserError
+from train.files import write_text
+from train.health import sensitivity
+from train.inference import reconstruct
+from train.metrics import cloud_errors, thin_out
+from train.table import format_table
+from train.trivial import medoid, nearest_by_image
 
 VIEW_COUNTS = (1, 2, 4, 8)
 _SHAPES_AT_ONCE = 16

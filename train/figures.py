@@ -19,8 +19,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from diffpoint import PinholeCamera, project
-
-from .files import replacing
+from train.files import replacing
 
 PREDICTED = LinearSegmentedColormap.from_list("predicted", ["#0b2545", "#1f6f8b", "#5fb3b3", "#cfe8e0"])
 TRUE = LinearSegmentedColormap.from_list("true", ["#3d1f0c", "#a4562a", "#dd9f63", "#f6e3c5"])
@@ -143,8 +142,7 @@ def reconstruction_figure(example: Example) -> Figure:
 
 
 def overview_figure(examples: Sequence[Example]) -> Figure:
-    """What the system does, in one picture: image, shapes it could be, the one that all images agree on,
-    truth."""
+    """What the system does, in one picture: image, shapes it could be, the one that all images agree on, truth."""
     count, views = len(examples[0].predictions), len(examples[0].images)
     figure, panels = _grid(rows=2 * len(examples), columns=count + 3)
     for example, (upper, lower) in zip(examples, panels.reshape(len(examples), 2, -1), strict=True):

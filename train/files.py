@@ -14,8 +14,7 @@ from pathlib import Path
 def replacing(target: Path) -> Iterator[Path]:
     """Yields a temporary path beside `target`; what is written there becomes `target` on success.
 
-    The path may be made a file, which replaces an old one in one step, or a directory, whose target must be
-    new.
+    The path may be made a file, which replaces an old one in one step, or a directory, whose target must be new.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")

@@ -17,16 +17,15 @@ from tqdm import tqdm
 
 from diffpoint import diversity_loss
 from models import PROFILES, Generator
-
-from .batches import Batch, LoadedSplit, load_split
-from .checkpoint import best_weights, latest_checkpoint, load_checkpoint, load_generator, save_checkpoint
-from .config import FitConfig, StageConfig, fit_config_from_json, to_json
-from .errors import UserError
-from .files import write_text
-from .interrupts import StopRequest
-from .log import RunLog
-from .objective import arrange_scenes, front_loss
-from .state import Training
+from train.batches import Batch, LoadedSplit, load_split
+from train.checkpoint import best_weights, latest_checkpoint, load_checkpoint, load_generator, save_checkpoint
+from train.config import FitConfig, StageConfig, fit_config_from_json, to_json
+from train.errors import UserError
+from train.files import write_text
+from train.interrupts import StopRequest
+from train.log import RunLog
+from train.objective import arrange_scenes, front_loss
+from train.state import Training
 
 _HEALTH_IMAGES = 12
 
@@ -103,8 +102,7 @@ def fit(data: Path, out: Path, config: FitConfig, *, resume: bool = False, progr
         True when training is complete, False when a signal (Ctrl-C, SIGTERM) ended it early, after saving.
 
     Raises:
-        UserError: unusable data or run, a configuration that does not fit them, or a training that has
-        failed.
+        UserError: unusable data or run, a configuration that does not fit them, or a training that has failed.
     """
     _check_run_directory(out, config, resume=resume)
     size = PROFILES[config.profile]

@@ -11,7 +11,7 @@ from PIL import Image, ImageOps
 from torch import Tensor
 from torch.nn import functional as F
 
-from .errors import UserError
+from train.errors import UserError
 
 
 def read_images(paths: Sequence[Path], *, size: int = 224) -> Tensor:
@@ -42,9 +42,8 @@ def _read(path: Path) -> Tensor:
         raise UserError(f"{path} does not exist or is no file; name the images to reconstruct from")
     try:
         with Image.open(path) as file:
-            image = ImageOps.exif_transpose(
-                file
-            )  # cameras note how they were held instead of turning the pixels
+            # Cameras note how they were held instead of turning the pixels.
+            image = ImageOps.exif_transpose(file)
             if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16", "F"):
                 image = image.convert("RGBA")
             pixels = np.atleast_3d(np.asarray(image))

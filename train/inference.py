@@ -20,8 +20,7 @@ class Reconstruction(NamedTuple):
     Attributes:
         points: (B, V*N, 3) the concatenated clouds, world frame.
         codes: (B, V, code_dim) the codes that made them.
-        history: (steps + 1, B) consistency loss x100 before every gradient step and after the last; (0, B)
-        when
+        history: (steps + 1, B) consistency loss x100 before every gradient step and after the last; (0, B) when
             there was nothing to agree on (one view) or nothing to choose (a deterministic network).
     """
 
@@ -99,8 +98,7 @@ def _most_consistent(model: Generator, features: Tensor, candidates: Tensor) -> 
 def _descend(
     model: Generator, features: Tensor, codes: Tensor, *, steps: int, step_size: float
 ) -> tuple[Tensor, list[Tensor]]:
-    """Plain gradient descent on (B, V, D) codes; every object has its own loss, so objects do not
-    interact."""
+    """Plain gradient descent on (B, V, D) codes; every object has its own loss, so objects do not interact."""
     history = []
     for _ in range(steps):
         codes = codes.detach().requires_grad_()

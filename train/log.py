@@ -8,7 +8,7 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-from .files import write_text
+from train.files import write_text
 
 
 class RunLog:

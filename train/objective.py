@@ -43,8 +43,7 @@ def arrange_scenes(clouds: Tensor, camera: PinholeCamera, depth: Tensor, *, join
         clouds: (R, B*V, N, 3), one cloud for each code and image.
         camera: (B, V).
         depth: (B, V, S, S).
-        joined_views: False: R*B*V scenes, each cloud before the one camera of its image. True: R*B scenes,
-        the V
+        joined_views: False: R*B*V scenes, each cloud before the one camera of its image. True: R*B scenes, the V
             clouds of one shape and code slot concatenated before the V cameras.
     """
     codes, points = clouds.shape[0], clouds.shape[2]

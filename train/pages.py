@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from torch import Tensor
 
-from .files import write_text
+from train.files import write_text
 
 _STYLE = """
 body { margin: 0; background: #f6f8f9; color: #1c2733; font: 16px/1.55 system-ui, "Segoe UI", sans-serif; }

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import trimesh
-
-from .checkpoint import config_of, load_generator
-from .errors import UserError
-from .files import replacing
-from .images import read_images
-from .inference import reconstruct
+from diffpoint.io import write_points
+from train.checkpoint import config_of, load_generator
+from train.errors import UserError
+from train.files import replacing
+from train.images import read_images
+from train.inference import reconstruct
 
 MOST_IMAGES = 24
 
@@ -27,13 +26,12 @@ def reconstruct_to_files(
 ) -> None:
     """Reconstructs one object and writes reconstruction.ply and reconstruction.html into `out`.
 
-    Everything is read and computed before anything is written. `groups` and `steps` are the run's if not
-    given.
+    Everything is read and computed before anything is written. `groups` and `steps` are the run's if not given.
 
     Raises:
         UserError: a run that is no run, an image that is no image, or a wrong number of either.
     """
-    from .pages import write_reconstruction_page
+    from train.pages import write_reconstruction_page
 
     if not 1 <= len(images) <= MOST_IMAGES:
         raise UserError(f"reconstruct takes 1 to {MOST_IMAGES} images; got {len(images)}")
@@ -53,8 +51,7 @@ def reconstruct_to_files(
         before, after = found.history[0, 0].item(), found.history[-1, 0].item()
         made += f"; the views' disagreement (chamfer x100) fell from {before:.2f} to {after:.2f}"
 
-    with replacing(out / "reconstruction.ply") as cloud, replacing(out / "reconstruction.html") as page:
-        ply = trimesh.PointCloud(points.numpy()).export(file_type="ply")
-        cloud.write_bytes(ply if isinstance(ply, bytes) else str(ply).encode())
+    with replacing(out / "reconstruction.html") as page:
         write_reconstruction_page(page, pictures, points, title="Reconstruction", subtitle=made)
+        write_points(out / "reconstruction.ply", points)
     print(f"wrote {out}/reconstruction.ply and {out}/reconstruction.html: {made}")

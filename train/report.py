@@ -10,16 +10,15 @@ from typing import Any
 import torch
 
 from models import Generator
-
-from . import figures, pages
-from .checkpoint import load_generator
-from .config import FitConfig, fit_config_from_json
-from .data import Shape, ShapeTree
-from .errors import UserError
-from .figures import Example
-from .files import write_text
-from .inference import reconstruct
-from .log import read_metrics
+from train import figures, pages
+from train.checkpoint import load_generator
+from train.config import FitConfig, fit_config_from_json
+from train.data import Shape, ShapeTree
+from train.errors import UserError
+from train.figures import Example
+from train.files import write_text
+from train.inference import reconstruct
+from train.log import read_metrics
 
 _CODES = 4
 _SHAPES = 3
@@ -101,8 +100,7 @@ def write_report(
 
 @torch.no_grad()
 def make_example(model: Generator, shape: Shape, config: FitConfig, *, seed: int) -> Example:
-    """A test shape, predictions from the image that shows its front best, and a reconstruction from all
-    images."""
+    """A test shape, predictions from the image that shows its front best, and a reconstruction from all images."""
     chosen = int(
         shape.camera.position[:, 2].argmax()
     )  # objects face +z: their backs are what this view hides

@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from models import Generator, build_generator
-
-from .batches import Batch, LoadedSplit, Sampler
-from .checkpoint import best_weights, save_weights
-from .config import FitConfig, StageConfig
-from .errors import UserError
-from .health import sensitivity
-from .validation import validate
+from train.batches import Batch, LoadedSplit, Sampler
+from train.checkpoint import best_weights, save_weights
+from train.config import FitConfig, StageConfig
+from train.errors import UserError
+from train.health import sensitivity
+from train.validation import validate
 
 _DEAF_CHECKS = 3
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import torch
 
 from models import Generator
-
-from .batches import LoadedSplit
-from .metrics import cloud_errors, thin_out
+from train.batches import LoadedSplit
+from train.metrics import cloud_errors, thin_out
 
 _SHAPES_AT_ONCE = 8
 
