@@ -167,7 +167,7 @@ class PinholeCamera:
     @property
     def position(self) -> Tensor:
         """Optical centres in the world, (..., 3)."""
-        return torch.linalg.inv(self.cam_from_world)[..., :3, 3] + 0.0  # no -0.0
+        return _inverse("cam_from_world", self.cam_from_world)[..., :3, 3] + 0.0  # no -0.0
 
     @property
     def projection(self) -> Tensor:
@@ -177,8 +177,8 @@ class PinholeCamera:
     @property
     def back_projection(self) -> Tensor:
         """(..., 3, 4): world point = d * (M[:, :3] @ (u, v, 1)) + M[:, 3] for the pixel position (u, v) at depth d."""
-        world_from_cam = torch.linalg.inv(self.cam_from_world)
-        rays = world_from_cam[..., :3, :3] @ torch.linalg.inv(self.K)
+        world_from_cam = _inverse("cam_from_world", self.cam_from_world)
+        rays = world_from_cam[..., :3, :3] @ _inverse("K", self.K)
         origin = world_from_cam[..., :3, 3:].expand(*rays.shape[:-1], 1)
         return torch.cat((rays, origin), dim=-1)
 
@@ -208,6 +208,14 @@ class PinholeCamera:
             raise IndexError("PinholeCamera: a single camera has no leading dimension to index.")
         whole = self.expand(*shape)
         return dataclasses.replace(self, K=whole.K[item], cam_from_world=whole.cam_from_world[item])
+
+
+def _inverse(name: str, matrix: Tensor) -> Tensor:
+    inverse, singular = torch.linalg.inv_ex(matrix)
+    if not torch.compiler.is_compiling() and bool(singular.any()):
+        got = matrix.detach()[singular > 0][0].tolist() if matrix.dim() > 2 else matrix.tolist()
+        raise _checks.fail("PinholeCamera", name, "be invertible", str(got), "Is a focal length 0?")
+    return inverse
 
 
 def _vector(name: str, value, like: Tensor | None = None) -> Tensor:

@@ -88,3 +88,14 @@ def test_what_is_no_camera_is_refused_by_name(change, message):
 def test_looking_along_up_is_refused():
     with pytest.raises(ValueError, match="Choose another 'up'"):
         dp.PinholeCamera.look_at((0, 2, 0), focal_px=10.0, height=4, width=4)
+
+
+def test_singular_matrices_are_named_where_they_are_inverted():
+    flat = torch.diag(torch.tensor([0.0, 1.0, 1.0]))
+    for K in (flat, torch.stack((torch.eye(3), flat))):
+        camera = dp.PinholeCamera(K, torch.eye(4), 2, 2)
+        with pytest.raises(ValueError, match=r"PinholeCamera: 'K' must be invertible; got \[\[0.0"):
+            dp.unproject(torch.ones(1, len(K) if K.dim() > 2 else 1, 2, 2), camera)
+    nowhere = dp.PinholeCamera(torch.eye(3), torch.diag(torch.tensor([1.0, 1.0, 0.0, 1.0])), 2, 2)
+    with pytest.raises(ValueError, match="'cam_from_world' must be invertible"):
+        _ = nowhere.position
