@@ -125,6 +125,9 @@ def check_splat_depth(case: Rendering) -> str:
     error = torch.maximum(of_winner(at.depth_error, index), of_winner(at.depth_error, splat.index))
     assert_within(splat.depth[hit], depth[hit], 2 * error)
     assert_within(of_winner(at.depth, splat.index), of_winner(at.depth, index), 2 * error)
+    axes = cloud.clean[:, None].expand(-1, len(matrices[0][0]), -1, -1).unbind(-1)
+    duplicate = torch.stack([of_winner(x, splat.index) == of_winner(x, index) for x in axes]).all(0)
+    assert torch.equal(splat.index[hit][duplicate], index[hit][duplicate]), "the lowest of equals"
     return AGREED if bool(decided.all()) else BANDED
 
 
