@@ -10,18 +10,20 @@ from torch import Tensor
 
 from diffpoint import _bridge, _checks
 from diffpoint._horizon import BIAS, FILTERS, REACH
+from diffpoint._runtime import runtime_info
 from diffpoint.camera import PinholeCamera
 from diffpoint.splat import splat_depth
 
 Method = Literal["zbuffer", "radius", "pyramid", "cone", "horizon", "hpr"]
+METHODS: tuple[Method, ...] = ("zbuffer", "radius", "pyramid", "cone", "horizon", "hpr")
 
 # radius and tolerance of each method, where the caller gives none
 _DEFAULTS = {
     "zbuffer": (0.0, 0.0),
-    "radius": (1.5, 1.0),
-    "pyramid": (4.0, 1.0),
-    "cone": (4.0, 0.4),
-    "horizon": (REACH, 0.15),
+    "radius": (2.0, 1.5),
+    "pyramid": (4.0, 2.0),
+    "cone": (3.0, 0.4),
+    "horizon": (REACH, 0.2),
     "hpr": (1.5, 0.0),
 }
 
@@ -125,24 +127,26 @@ def _visible(
         return torch.zeros(shape, dtype=torch.bool)
     if method == "hpr":
         return _on_flipped_hull(points, lengths, projection, height, width, radius)
-    rows = shape[0] * shape[1]
-    visible = torch.empty(rows * count, dtype=torch.uint8)
+    visible = torch.empty(shape, dtype=torch.uint8)
+    # Views take turns in the working memory of a few workers: fresh memory for each would cost as much as the work.
+    workers = min(shape[0] * shape[1], 4 * runtime_info().threads)
     inputs = points.reshape(-1), lengths, projection.reshape(-1)
-    image = points.new_empty(rows * count * 3)
-    cells = torch.empty(rows * (8 * count + 32), dtype=torch.int32)
-    sizes = shape[1], count, height, width
+    image = points.new_empty(workers * count * 3)
+    cells = torch.empty(workers * (8 * count + 32), dtype=torch.int32)
+    sizes = workers, shape[1], count, height, width
     if method == "horizon":
         kernel, last = "horizon", _limit(tolerance)
         filters = torch.tensor(FILTERS, dtype=points.dtype).view(-1)
         scratch = (
+            torch.empty(workers * count, dtype=torch.int32),
             points.new_empty(cells.shape),
-            torch.empty(rows * count, dtype=torch.int32),
-            torch.empty_like(image),
+            torch.empty(workers * (count + 1), dtype=torch.int32),
+            points.new_empty(workers * (count + 1) * 3),
             filters,
         )
     else:
-        depth = points.new_empty(rows * height * width)
-        owner = torch.empty(rows * height * width, dtype=torch.int32)
+        depth = points.new_empty(workers * height * width)
+        owner = torch.empty(workers * height * width, dtype=torch.int32)
         kernel, last = {"radius": "slab"}.get(method, method), tolerance
         scratch = {
             "radius": (depth,),
@@ -150,9 +154,19 @@ def _visible(
             "cone": (depth, owner),
         }[method]
     _bridge.launch(
-        "visibility", kernel, points.dtype, *inputs, image, cells, *scratch, visible, *sizes, radius, last
+        "visibility",
+        kernel,
+        points.dtype,
+        *inputs,
+        image,
+        cells,
+        *scratch,
+        visible.view(-1),
+        *sizes,
+        radius,
+        last,
     )
-    return visible.view(torch.bool).view(shape)
+    return visible.view(torch.bool)
 
 
 def _limit(probability: float) -> float:

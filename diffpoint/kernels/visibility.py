@@ -27,6 +27,7 @@ def build(real):
         projection: ti.template(),
         image: ti.template(),
         cells: ti.template(),
+        slot,
         view,
         cloud,
         count,
@@ -55,7 +56,7 @@ def build(real):
             u = (camera[0] * x + camera[1] * y + camera[2] * z + camera[3]) / d
             v = (camera[4] * x + camera[5] * y + camera[6] * z + camera[7]) / d
             seen = (i < length) & (d > 0) & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
-            at = (view * count + i) * 3
+            at = (slot * count + i) * 3
             image[at] = ti.select(seen, u, real(0.0))
             image[at + 1] = ti.select(seen, v, real(0.0))
             image[at + 2] = real(ti.math.inf)
@@ -76,11 +77,11 @@ def build(real):
             per_side = real(1.0) / side
             across_cells = ti.cast(extent_u * per_side, ti.i32) + 1
             down_cells = ti.cast(extent_v * per_side, ti.i32) + 1
-            first = view * (8 * count + 32)
+            first = slot * (8 * count + 32)
             for c in range(first, first + across_cells * down_cells):
                 cells[c] = 0
             for i in range(count):
-                at = (view * count + i) * 3
+                at = (slot * count + i) * 3
                 if image[at + 2] < real(ti.math.inf):
                     column = ti.cast((image[at] - low_u) * per_side, ti.i32)
                     row = ti.cast((image[at + 1] - low_v) * aspect * per_side, ti.i32)
@@ -103,18 +104,18 @@ def build(real):
 
     @ti.func
     def nearest_map(
-        image: ti.template(), depth: ti.template(), owner: ti.template(), view, count, height, width
+        image: ti.template(), depth: ti.template(), owner: ti.template(), slot, count, height, width
     ):
         """The z-buffer of w and its owners: the nearest wins, then the lowest index."""
         pixels = height * width
-        for p in range(view * pixels, view * pixels + pixels):
+        for p in range(slot * pixels, slot * pixels + pixels):
             depth[p] = real(ti.math.inf)
-        for p in range(view * pixels, view * pixels + pixels):
+        for p in range(slot * pixels, slot * pixels + pixels):
             owner[p] = -1
         for i in range(count):
-            at = (view * count + i) * 3
+            at = (slot * count + i) * 3
             w = image[at + 2]
-            p = view * pixels + ti.cast(image[at + 1], ti.i32) * width + ti.cast(image[at], ti.i32)
+            p = slot * pixels + ti.cast(image[at + 1], ti.i32) * width + ti.cast(image[at], ti.i32)
             if w < depth[p]:
                 depth[p] = w
                 owner[p] = i
@@ -128,6 +129,7 @@ def build(real):
         cells: small,
         depth: reals,
         visible: flags,
+        workers: ti.i32,
         views: ti.i32,
         count: ti.i32,
         height: ti.i32,
@@ -137,34 +139,40 @@ def build(real):
         spread: ti.i32,
     ):
         """Points at most `tolerance` behind the nearest point within `radius` of their pixel."""
-        for step in range(lengths.shape[0] * views * spread):
+        for step in range(workers * spread):
             if step % spread == 0:
-                view = step // spread
-                cloud = view // views
-                length = ti.cast(lengths[cloud], ti.i32)
-                _, spacing, _, _, _, _, _ = place(
-                    points, projection, image, cells, view, cloud, count, length, height, width
-                )
-                pixels = height * width
-                for p in range(view * pixels, view * pixels + pixels):
-                    depth[p] = real(ti.math.inf)
-                reach = ti.min(ti.cast(radius * spacing + real(0.5), ti.i32), ti.max(height, width))
-                for i in range(count):
-                    at = (view * count + i) * 3
-                    w = image[at + 2]
-                    if w < real(ti.math.inf):
-                        column = ti.cast(image[at], ti.i32)
-                        row = ti.cast(image[at + 1], ti.i32)
-                        for r in range(ti.max(row - reach, 0), ti.min(row + reach + 1, height)):
-                            for c in range(ti.max(column - reach, 0), ti.min(column + reach + 1, width)):
-                                p = view * pixels + r * width + c
-                                depth[p] = ti.select(w < depth[p], w, depth[p])
-                for i in range(count):
-                    at = (view * count + i) * 3
-                    w = image[at + 2]
-                    p = view * pixels + ti.cast(image[at + 1], ti.i32) * width + ti.cast(image[at], ti.i32)
-                    kept = (w < real(ti.math.inf)) & (w <= depth[p] + tolerance * spacing)
-                    visible[view * count + i] = ti.cast(kept, ti.u8)
+                slot = step // spread
+                for turn in range((lengths.shape[0] * views - slot + workers - 1) // workers):
+                    view = slot + turn * workers
+                    cloud = view // views
+                    length = ti.cast(lengths[cloud], ti.i32)
+                    _, spacing, _, _, _, _, _ = place(
+                        points, projection, image, cells, slot, view, cloud, count, length, height, width
+                    )
+                    pixels = height * width
+                    for p in range(slot * pixels, slot * pixels + pixels):
+                        depth[p] = real(ti.math.inf)
+                    reach = ti.min(ti.cast(radius * spacing + real(0.5), ti.i32), ti.max(height, width))
+                    for i in range(count):
+                        at = (slot * count + i) * 3
+                        w = image[at + 2]
+                        if w < real(ti.math.inf):
+                            column = ti.cast(image[at], ti.i32)
+                            row = ti.cast(image[at + 1], ti.i32)
+                            for r in range(ti.max(row - reach, 0), ti.min(row + reach + 1, height)):
+                                for c in range(ti.max(column - reach, 0), ti.min(column + reach + 1, width)):
+                                    p = slot * pixels + r * width + c
+                                    depth[p] = ti.select(w < depth[p], w, depth[p])
+                    for i in range(count):
+                        at = (slot * count + i) * 3
+                        w = image[at + 2]
+                        p = (
+                            slot * pixels
+                            + ti.cast(image[at + 1], ti.i32) * width
+                            + ti.cast(image[at], ti.i32)
+                        )
+                        kept = (w < real(ti.math.inf)) & (w <= depth[p] + tolerance * spacing)
+                        visible[view * count + i] = ti.cast(kept, ti.u8)
 
     @ti.kernel
     def pyramid(
@@ -177,6 +185,7 @@ def build(real):
         owner: small,
         coarse: reals,
         visible: flags,
+        workers: ti.i32,
         views: ti.i32,
         count: ti.i32,
         height: ti.i32,
@@ -186,33 +195,37 @@ def build(real):
         spread: ti.i32,
     ):
         """Owners of a pixel that lie at most `tolerance` behind the nearest of a block of pixels of side `radius`."""
-        for step in range(lengths.shape[0] * views * spread):
+        for step in range(workers * spread):
             if step % spread == 0:
-                view = step // spread
-                cloud = view // views
-                length = ti.cast(lengths[cloud], ti.i32)
-                _, spacing, _, _, _, _, _ = place(
-                    points, projection, image, cells, view, cloud, count, length, height, width
-                )
-                nearest_map(image, depth, owner, view, count, height, width)
-                pixels = height * width
-                side = ti.max(ti.min(ti.cast(radius * spacing + real(0.5), ti.i32), ti.max(height, width)), 2)
-                across = (width + side - 1) // side
-                for b in range(view * pixels, view * pixels + pixels):
-                    coarse[b] = real(ti.math.inf)
-                for r in range(height):
-                    for c in range(width):
-                        w = depth[view * pixels + r * width + c]
-                        b = view * pixels + (r // side) * across + c // side
-                        coarse[b] = ti.select(w < coarse[b], w, coarse[b])
-                for i in range(view * count, view * count + count):
-                    visible[i] = ti.u8(0)
-                for r in range(height):
-                    for c in range(width):
-                        p = view * pixels + r * width + c
-                        b = view * pixels + (r // side) * across + c // side
-                        if (owner[p] >= 0) & (depth[p] <= coarse[b] + tolerance * spacing):
-                            visible[view * count + owner[p]] = ti.u8(1)
+                slot = step // spread
+                for turn in range((lengths.shape[0] * views - slot + workers - 1) // workers):
+                    view = slot + turn * workers
+                    cloud = view // views
+                    length = ti.cast(lengths[cloud], ti.i32)
+                    _, spacing, _, _, _, _, _ = place(
+                        points, projection, image, cells, slot, view, cloud, count, length, height, width
+                    )
+                    nearest_map(image, depth, owner, slot, count, height, width)
+                    pixels = height * width
+                    side = ti.max(
+                        ti.min(ti.cast(radius * spacing + real(0.5), ti.i32), ti.max(height, width)), 2
+                    )
+                    across = (width + side - 1) // side
+                    for b in range(slot * pixels, slot * pixels + pixels):
+                        coarse[b] = real(ti.math.inf)
+                    for r in range(height):
+                        for c in range(width):
+                            w = depth[slot * pixels + r * width + c]
+                            b = slot * pixels + (r // side) * across + c // side
+                            coarse[b] = ti.select(w < coarse[b], w, coarse[b])
+                    for i in range(view * count, view * count + count):
+                        visible[i] = ti.u8(0)
+                    for r in range(height):
+                        for c in range(width):
+                            p = slot * pixels + r * width + c
+                            b = slot * pixels + (r // side) * across + c // side
+                            if (owner[p] >= 0) & (depth[p] <= coarse[b] + tolerance * spacing):
+                                visible[view * count + owner[p]] = ti.u8(1)
 
     @ti.kernel
     def cone(
@@ -224,6 +237,7 @@ def build(real):
         depth: reals,
         owner: small,
         visible: flags,
+        workers: ti.i32,
         views: ti.i32,
         count: ti.i32,
         height: ti.i32,
@@ -233,39 +247,43 @@ def build(real):
         spread: ti.i32,
     ):
         """Owners of a pixel with at least 1 - `tolerance` of the half space before them open, in 8 sectors."""
-        for step in range(lengths.shape[0] * views * spread):
+        for step in range(workers * spread):
             if step % spread == 0:
-                view = step // spread
-                cloud = view // views
-                length = ti.cast(lengths[cloud], ti.i32)
-                _, spacing, _, _, _, _, _ = place(
-                    points, projection, image, cells, view, cloud, count, length, height, width
-                )
-                nearest_map(image, depth, owner, view, count, height, width)
-                pixels = height * width
-                reach = ti.max(
-                    ti.min(ti.cast(radius * spacing + real(0.5), ti.i32), ti.max(height, width)), 1
-                )
-                for i in range(view * count, view * count + count):
-                    visible[i] = ti.u8(0)
-                for row in range(height):
-                    for column in range(width):
-                        own = view * pixels + row * width + column
-                        if owner[own] >= 0:
-                            closed = ti.Vector([real(0.0) for _ in ti.static(range(8))])
-                            for r in range(ti.max(row - reach, 0), ti.min(row + reach + 1, height)):
-                                for c in range(ti.max(column - reach, 0), ti.min(column + reach + 1, width)):
-                                    gap = depth[own] - depth[view * pixels + r * width + c]
-                                    if gap > 0:
-                                        dx = ti.cast(c - column, real)
-                                        dy = ti.cast(r - row, real)
-                                        cosine = gap / ti.sqrt(gap * gap + dx * dx + dy * dy)
-                                        sector = octant(dx, dy)
-                                        for k in ti.static(range(8)):
-                                            higher = (sector == k) & (cosine > closed[k])
-                                            closed[k] = ti.select(higher, cosine, closed[k])
-                            if closed.sum() <= tolerance * real(8.0):
-                                visible[view * count + owner[own]] = ti.u8(1)
+                slot = step // spread
+                for turn in range((lengths.shape[0] * views - slot + workers - 1) // workers):
+                    view = slot + turn * workers
+                    cloud = view // views
+                    length = ti.cast(lengths[cloud], ti.i32)
+                    _, spacing, _, _, _, _, _ = place(
+                        points, projection, image, cells, slot, view, cloud, count, length, height, width
+                    )
+                    nearest_map(image, depth, owner, slot, count, height, width)
+                    pixels = height * width
+                    reach = ti.max(
+                        ti.min(ti.cast(radius * spacing + real(0.5), ti.i32), ti.max(height, width)), 1
+                    )
+                    for i in range(view * count, view * count + count):
+                        visible[i] = ti.u8(0)
+                    for row in range(height):
+                        for column in range(width):
+                            own = slot * pixels + row * width + column
+                            if owner[own] >= 0:
+                                closed = ti.Vector([real(0.0) for _ in ti.static(range(8))])
+                                for r in range(ti.max(row - reach, 0), ti.min(row + reach + 1, height)):
+                                    for c in range(
+                                        ti.max(column - reach, 0), ti.min(column + reach + 1, width)
+                                    ):
+                                        gap = depth[own] - depth[slot * pixels + r * width + c]
+                                        if gap > 0:
+                                            dx = ti.cast(c - column, real)
+                                            dy = ti.cast(r - row, real)
+                                            cosine = gap / ti.sqrt(gap * gap + dx * dx + dy * dy)
+                                            sector = octant(dx, dy)
+                                            for k in ti.static(range(8)):
+                                                higher = (sector == k) & (cosine > closed[k])
+                                                closed[k] = ti.select(higher, cosine, closed[k])
+                                if closed.sum() <= tolerance * real(8.0):
+                                    visible[view * count + owner[own]] = ti.u8(1)
 
     @ti.func
     def octant(dx, dy):
@@ -277,60 +295,14 @@ def build(real):
         )
 
     @ti.func
-    def drop_enclosed(
+    def sort_open(
         image: ti.template(),
+        cell: ti.template(),
         front: ti.template(),
-        view,
-        count,
-        inside,
-        low_u,
-        low_v,
-        extent_u,
-        extent_v,
-        aspect,
-        spacing,
-    ):
-        """Take out of the image what lies deep behind the cells on both sides of it; returns how many remain."""
-        n = ti.cast(inside, real)
-        side = cell_side(extent_u, extent_v, real(2.0) * n, n / real(2.0), real(CELL) * spacing)
-        per_side = real(1.0) / side
-        across = ti.cast(extent_u * per_side, ti.i32) + 3  # a ring of empty cells all around
-        down = ti.cast(extent_v * per_side, ti.i32) + 3
-        first = view * (8 * count + 32)
-        for c in range(first, first + across * down):
-            front[c] = real(ti.math.inf)
-        for i in range(count):
-            at = (view * count + i) * 3
-            w = image[at + 2]
-            if w < real(ti.math.inf):
-                column = ti.cast((image[at] - low_u) * per_side, ti.i32) + 1
-                row = ti.cast((image[at + 1] - low_v) * aspect * per_side, ti.i32) + 1
-                c = first + row * across + column
-                front[c] = ti.select(w < front[c], w, front[c])
-        remain = 0
-        for i in range(count):
-            at = (view * count + i) * 3
-            w = image[at + 2]
-            if w < real(ti.math.inf):
-                column = ti.cast((image[at] - low_u) * per_side, ti.i32) + 1
-                row = ti.cast((image[at + 1] - low_v) * aspect * per_side, ti.i32) + 1
-                c = first + row * across + column
-                level = ti.max(front[c - 1], front[c + 1])
-                level = ti.min(level, ti.max(front[c - across], front[c + across]))
-                level = ti.min(level, ti.max(front[c - across - 1], front[c + across + 1]))
-                level = ti.min(level, ti.max(front[c - across + 1], front[c + across - 1]))
-                enclosed = w > level + real(DEEP) * spacing
-                image[at + 2] = ti.select(enclosed, real(ti.math.inf), w)
-                remain += ti.select(enclosed, 0, 1)
-        return remain
-
-    @ti.func
-    def sort_into_cells(
-        image: ti.template(),
-        cells: ti.template(),
+        ends: ti.template(),
         order: ti.template(),
         packed: ti.template(),
-        view,
+        slot,
         count,
         low_u,
         low_v,
@@ -338,31 +310,65 @@ def build(real):
         per_side,
         across,
         down,
+        deep,
     ):
-        """Counting sort: `packed` holds the points of the frame cell by cell, `cells` where each cell ends."""
-        first = view * (8 * count + 32)
-        for c in range(first, first + across * down + 1):
-            cells[c] = 0
-        for i in range(count):
-            at = (view * count + i) * 3
-            if image[at + 2] < real(ti.math.inf):
-                column = ti.cast((image[at] - low_u) * per_side, ti.i32)
-                row = ti.cast((image[at + 1] - low_v) * aspect * per_side, ti.i32)
-                cells[first + row * across + column + 1] += 1
+        """Counting sort, cell by cell, of the points that are not `deep` behind cells on both sides of theirs.
+
+        `packed` and `order` then hold them and their indices, `ends` where each cell's end; returns how many they are.
+        """
+        first = slot * (8 * count + 32)
         for c in range(first, first + across * down):
-            cells[c + 1] += cells[c]
-        for i in range(count):
-            at = (view * count + i) * 3
-            if image[at + 2] < real(ti.math.inf):
-                column = ti.cast((image[at] - low_u) * per_side, ti.i32)
-                row = ti.cast((image[at + 1] - low_v) * aspect * per_side, ti.i32)
+            front[c] = real(ti.math.inf)
+        for c in range(first, first + across * down):
+            ends[c] = 0
+        for i in range(slot * count, slot * count + count):
+            w = image[i * 3 + 2]
+            if w < real(ti.math.inf):
+                column = ti.cast((image[i * 3] - low_u) * per_side, ti.i32) + 1
+                row = ti.cast((image[i * 3 + 1] - low_v) * aspect * per_side, ti.i32) + 1
                 c = first + row * across + column
-                slot = view * count + cells[c]
-                cells[c] += 1
-                order[slot] = i
-                packed[slot * 3] = image[at] - low_u
-                packed[slot * 3 + 1] = (image[at + 1] - low_v) * aspect
-                packed[slot * 3 + 2] = image[at + 2]
+                cell[i] = c
+                front[c] = ti.select(w < front[c], w, front[c])
+        for i in range(slot * count, slot * count + count):
+            w = image[i * 3 + 2]
+            if w < real(ti.math.inf):
+                c = cell[i]
+                level = higher(front[c - 1], front[c + 1])
+                level = lower(level, higher(front[c - across], front[c + across]))
+                level = lower(level, higher(front[c - across - 1], front[c + across + 1]))
+                level = lower(level, higher(front[c - across + 1], front[c + across - 1]))
+                enclosed = w > level + deep
+                ends[c] += ti.select(enclosed, 0, 1)
+                # The spare place at the end takes the enclosed points: cheaper than a branch nobody can predict.
+                cell[i] = ti.select(enclosed, -1, c)
+            else:
+                cell[i] = -1
+        total = 0
+        for c in range(first, first + across * down):
+            here = ends[c]
+            ends[c] = total
+            total += here
+        begin = slot * (count + 1)
+        for i in range(count):
+            at = (slot * count + i) * 3
+            c = cell[slot * count + i]
+            kept = c >= 0
+            c = ti.select(kept, c, first)
+            target = begin + ti.select(kept, ends[c], count)
+            ends[c] += ti.select(kept, 1, 0)
+            order[target] = i
+            packed[target * 3] = image[at] - low_u
+            packed[target * 3 + 1] = (image[at + 1] - low_v) * aspect
+            packed[target * 3 + 2] = image[at + 2]
+        return total
+
+    @ti.func
+    def lower(a, b):
+        return ti.select(a < b, a, b)
+
+    @ti.func
+    def higher(a, b):
+        return ti.select(a > b, a, b)
 
     @ti.kernel
     def horizon(
@@ -371,11 +377,13 @@ def build(real):
         projection: reals,
         image: reals,
         cells: small,
+        cell: small,
         front: reals,
         order: small,
         packed: reals,
         filters: reals,
         visible: flags,
+        workers: ti.i32,
         views: ti.i32,
         count: ti.i32,
         height: ti.i32,
@@ -385,71 +393,88 @@ def build(real):
         spread: ti.i32,
     ):
         """Points whose 8 horizons within `radius` score at most `limit` under the filters."""
-        for step in range(lengths.shape[0] * views * spread):
+        for step in range(workers * spread):
             if step % spread == 0:
-                view = step // spread
-                cloud = view // views
-                length = ti.cast(lengths[cloud], ti.i32)
-                aspect, spacing, low_u, low_v, extent_u, extent_v, inside = place(
-                    points, projection, image, cells, view, cloud, count, length, height, width
-                )
-                for i in range(view * count, view * count + count):
-                    visible[i] = ti.u8(0)
-                inside = drop_enclosed(
-                    image, front, view, count, inside, low_u, low_v, extent_u, extent_v, aspect, spacing
-                )
-                n = ti.cast(inside, real)
-                reach = radius * spacing
-                side = cell_side(extent_u, extent_v, real(2.0) * n, n, reach / real(2.0))
-                per_side = real(1.0) / side
-                across = ti.cast(extent_u * per_side, ti.i32) + 1
-                down = ti.cast(extent_v * per_side, ti.i32) + 1
-                if inside > 0:
-                    sort_into_cells(
-                        image, cells, order, packed, view, count, low_u, low_v, aspect, per_side, across, down
+                slot = step // spread
+                for turn in range((lengths.shape[0] * views - slot + workers - 1) // workers):
+                    view = slot + turn * workers
+                    cloud = view // views
+                    length = ti.cast(lengths[cloud], ti.i32)
+                    aspect, spacing, low_u, low_v, extent_u, extent_v, inside = place(
+                        points, projection, image, cells, slot, view, cloud, count, length, height, width
                     )
-                last = view * count + inside - 1
-                for tile in range((inside + _LANES - 1) // _LANES):
-                    begin = view * count + tile * _LANES
-                    x = ti.Vector([packed[ti.min(begin + s, last) * 3] for s in ti.static(range(_LANES))])
-                    y = ti.Vector([packed[ti.min(begin + s, last) * 3 + 1] for s in ti.static(range(_LANES))])
-                    w = ti.Vector([packed[ti.min(begin + s, last) * 3 + 2] for s in ti.static(range(_LANES))])
-                    # Eight vectors by name: a matrix would not stay in registers.
-                    none = ti.Vector([real(-1.0) for _ in ti.static(range(_LANES))])
-                    c0, c1, c2, c3, c4, c5, c6, c7 = none, none, none, none, none, none, none, none
-                    left = ti.max(ti.cast((x.min() - reach) * per_side, ti.i32), 0)
-                    right = ti.min(ti.cast((x.max() + reach) * per_side, ti.i32), across - 1)
-                    top = ti.max(ti.cast((y.min() - reach) * per_side, ti.i32), 0)
-                    bottom = ti.min(ti.cast((y.max() + reach) * per_side, ti.i32), down - 1)
-                    for row in range(top, bottom + 1):
-                        # After the sort cells[c] is where cell c ends, hence where c + 1 begins.
-                        row_first = view * (8 * count + 32) + row * across
-                        start = 0
-                        if row_first + left > view * (8 * count + 32):
-                            start = cells[row_first + left - 1]
-                        for j in range(view * count + start, view * count + cells[row_first + right]):
-                            dx = packed[j * 3] - x
-                            dy = packed[j * 3 + 1] - y
-                            gap = w - packed[j * 3 + 2]
-                            d = dx * dx + dy * dy
-                            whole = d + gap * gap
-                            near = (d <= reach * reach) & (whole > 0)
-                            # Squared cosine between the view's axis and the way to the neighbour, signed.
-                            rise = gap * ti.abs(gap) / ti.max(whole, real(1e-30))
-                            rise = ti.select(near, rise, real(-1.0))
-                            sector = octant(dx, dy)
-                            c0 = raised(c0, rise, sector == 0)
-                            c1 = raised(c1, rise, sector == 1)
-                            c2 = raised(c2, rise, sector == 3)
-                            c3 = raised(c3, rise, sector == 2)
-                            c4 = raised(c4, rise, sector == 6)
-                            c5 = raised(c5, rise, sector == 7)
-                            c6 = raised(c6, rise, sector == 5)
-                            c7 = raised(c7, rise, sector == 4)
-                    score = judge(filters, c0, c1, c2, c3, c4, c5, c6, c7)
-                    for s in ti.static(range(_LANES)):
-                        if begin + s <= last:
-                            visible[view * count + order[begin + s]] = ti.cast(score[s] <= limit, ti.u8)
+                    for i in range(view * count, view * count + count):
+                        visible[i] = ti.u8(0)
+                    reach = radius * spacing
+                    n = ti.cast(inside, real)
+                    side = cell_side(extent_u, extent_v, real(2.0) * n, n / real(2.0), real(CELL) * spacing)
+                    per_side = real(1.0) / side
+                    across = ti.cast(extent_u * per_side, ti.i32) + 3  # a ring of empty cells all around
+                    down = ti.cast(extent_v * per_side, ti.i32) + 3
+                    remaining = 0
+                    if inside > 0:
+                        remaining = sort_open(
+                            image,
+                            cell,
+                            front,
+                            cells,
+                            order,
+                            packed,
+                            slot,
+                            count,
+                            low_u,
+                            low_v,
+                            aspect,
+                            per_side,
+                            across,
+                            down,
+                            real(DEEP) * spacing,
+                        )
+                    first = slot * (8 * count + 32)
+                    last = slot * (count + 1) + remaining - 1
+                    for tile in range((remaining + _LANES - 1) // _LANES):
+                        begin = slot * (count + 1) + tile * _LANES
+                        x = ti.Vector([packed[ti.min(begin + s, last) * 3] for s in ti.static(range(_LANES))])
+                        y = ti.Vector(
+                            [packed[ti.min(begin + s, last) * 3 + 1] for s in ti.static(range(_LANES))]
+                        )
+                        w = ti.Vector(
+                            [packed[ti.min(begin + s, last) * 3 + 2] for s in ti.static(range(_LANES))]
+                        )
+                        # Eight vectors by name: a matrix would not stay in registers.
+                        none = ti.Vector([real(-1.0) for _ in ti.static(range(_LANES))])
+                        c0, c1, c2, c3, c4, c5, c6, c7 = none, none, none, none, none, none, none, none
+                        left = ti.max(ti.cast((x.min() - reach) * per_side, ti.i32) + 1, 1)
+                        right = ti.min(ti.cast((x.max() + reach) * per_side, ti.i32) + 1, across - 2)
+                        top = ti.max(ti.cast((y.min() - reach) * per_side, ti.i32) + 1, 1)
+                        bottom = ti.min(ti.cast((y.max() + reach) * per_side, ti.i32) + 1, down - 2)
+                        for row in range(top, bottom + 1):
+                            # A row of cells is one run of points; a cell begins where the one before it ends.
+                            run = slot * (count + 1)
+                            start = run + cells[first + row * across + left - 1]
+                            for j in range(start, run + cells[first + row * across + right]):
+                                dx = packed[j * 3] - x
+                                dy = packed[j * 3 + 1] - y
+                                gap = w - packed[j * 3 + 2]
+                                d = dx * dx + dy * dy
+                                whole = d + gap * gap
+                                near = (d <= reach * reach) & (whole > 0)
+                                # Squared cosine between the view's axis and the way to the neighbour, signed.
+                                rise = gap * ti.abs(gap) / ti.max(whole, real(1e-30))
+                                rise = ti.select(near, rise, real(-1.0))
+                                sector = octant(dx, dy)
+                                c0 = raised(c0, rise, sector == 0)
+                                c1 = raised(c1, rise, sector == 1)
+                                c2 = raised(c2, rise, sector == 3)
+                                c3 = raised(c3, rise, sector == 2)
+                                c4 = raised(c4, rise, sector == 6)
+                                c5 = raised(c5, rise, sector == 7)
+                                c6 = raised(c6, rise, sector == 5)
+                                c7 = raised(c7, rise, sector == 4)
+                        score = judge(filters, c0, c1, c2, c3, c4, c5, c6, c7)
+                        for s in ti.static(range(_LANES)):
+                            if begin + s <= last:
+                                visible[view * count + order[begin + s]] = ti.cast(score[s] <= limit, ti.u8)
 
     @ti.func
     def raised(horizon, rise, here):
