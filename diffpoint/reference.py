@@ -140,7 +140,7 @@ def visible_points(
     lengths: Tensor | None = None,
     filters: Tensor | None = None,
 ) -> Tensor:
-    """(B, V, N): the tests of visibility one view after the other; `filters` (16, 11) and a score for "horizon"."""
+    """(B, V, N): the tests of visibility one view after the other; `filters` (F, 11) and a score for "horizon"."""
     batch, views = cam_from_world.shape[:2]
     visible = torch.zeros((batch, views, points.shape[1]), dtype=torch.bool)
     for b, v in itertools.product(range(batch), range(views)):
@@ -226,12 +226,13 @@ def octant(dx: Tensor, dy: Tensor) -> Tensor:
 
 
 def horizons(
-    image: Tensor, aspect: float, spacing: float, radius: float, *, cell: float = 1.5, deep: float = 3.0
+    image: Tensor, aspect: float, spacing: float, radius: float, *, cell: float = 2.5, deep: float = 1.5
 ) -> tuple[Tensor, Tensor]:
     """Cosine to the view's axis of the highest neighbour in 8 sectors (m, 8), and the m points it is known of.
 
-    The cosine is negative where the highest neighbour is farther than the point, -1 where there is none. Points that
-    are enclosed (`deep` behind two opposite of the 8 cells around theirs) are hidden, and nobody's neighbours.
+    The cosine is negative where the highest neighbour is farther than the point, -1 where there is none. Points are
+    enclosed if on two of the four lines through their cell the cells on both sides are nearer by `deep`; these are
+    hidden, and nobody's neighbours.
     """
     flat = (image[:, :2] - image[:, :2].min(0).values) * image.new_tensor([1.0, aspect])
     open_ = (~_enclosed(flat, image[:, 2], spacing, cell, deep)).nonzero()[:, 0]
@@ -257,7 +258,7 @@ def _enclosed(flat: Tensor, w: Tensor, spacing: float, cell: float, deep: float)
         torch.maximum(front[row + 1 + dy, column + 1 + dx], front[row + 1 - dy, column + 1 - dx])
         for dy, dx in sides
     ]
-    return w > torch.stack(pairs).min(0).values + deep * spacing
+    return w > torch.stack(pairs).sort(0).values[1] + deep * spacing
 
 
 def horizon_score(horizon: Tensor, filters: Tensor) -> Tensor:

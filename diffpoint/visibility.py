@@ -23,7 +23,7 @@ _DEFAULTS = {
     "radius": (2.0, 1.5),
     "pyramid": (4.0, 2.0),
     "cone": (3.0, 0.4),
-    "horizon": (REACH, 0.2),
+    "horizon": (REACH, 0.22),
     "hpr": (1.5, 0.0),
 }
 
@@ -140,8 +140,8 @@ def _visible(
         scratch = (
             torch.empty(workers * count, dtype=torch.int32),
             points.new_empty(cells.shape),
-            torch.empty(workers * (count + 1), dtype=torch.int32),
-            points.new_empty(workers * (count + 1) * 3),
+            torch.empty(workers * (count + 17), dtype=torch.int32),
+            points.new_empty(workers * (count + 17) * 3),
             filters,
         )
     else:

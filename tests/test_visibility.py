@@ -133,6 +133,8 @@ def test_collapsed_and_collinear_clouds(method):
     same = torch.full((2, 40, 3), 0.1)
     line = torch.linspace(-0.3, 0.3, 40)[:, None] * torch.tensor([1.0, 1.0, 0.2]) * torch.ones(2, 1, 1)
     assert dp.visible_points(same, camera, method=method).any(-1).all()
+    if method == "horizon":
+        assert dp.visible_points(same, camera, method=method).all()
     assert dp.visible_points(line, camera, method=method).any(-1).all()
 
 

@@ -8,10 +8,11 @@ from types import SimpleNamespace
 
 from diffpoint.kernels._backend import ti
 
-FILTERS = 16
+FILTERS = 8
 """Filters of the horizon test; each reads the 8 sectors from each of them in turn."""
-CELL, DEEP = 1.5, 3.0
-"""A point this many spacings behind two opposite of the 8 cells around its cell is hidden; cells have this side."""
+CELL, DEEP = 2.5, 1.5
+"""Cells have this side, in spacings of the points; a point is enclosed if on two of the four lines through its cell the
+cells on both sides are this much nearer."""
 _LANES = 16  # points judged at once in the horizon test: one vector register
 
 
@@ -312,7 +313,7 @@ def build(real):
         down,
         deep,
     ):
-        """Counting sort, cell by cell, of the points that are not `deep` behind cells on both sides of theirs.
+        """Counting sort, cell by cell, of the points that are not enclosed (see `DEEP`).
 
         `packed` and `order` then hold them and their indices, `ends` where each cell's end; returns how many they are.
         """
@@ -333,10 +334,14 @@ def build(real):
             w = image[i * 3 + 2]
             if w < real(ti.math.inf):
                 c = cell[i]
-                level = higher(front[c - 1], front[c + 1])
-                level = lower(level, higher(front[c - across], front[c + across]))
-                level = lower(level, higher(front[c - across - 1], front[c + across + 1]))
-                level = lower(level, higher(front[c - across + 1], front[c + across - 1]))
+                first_line = higher(front[c - 1], front[c + 1])
+                second_line = higher(front[c - across], front[c + across])
+                third_line = higher(front[c - across - 1], front[c + across + 1])
+                fourth_line = higher(front[c - across + 1], front[c + across - 1])
+                level = lower(
+                    higher(lower(first_line, second_line), lower(third_line, fourth_line)),
+                    lower(higher(first_line, second_line), higher(third_line, fourth_line)),
+                )
                 enclosed = w > level + deep
                 ends[c] += ti.select(enclosed, 0, 1)
                 # The spare place at the end takes the enclosed points: cheaper than a branch nobody can predict.
@@ -348,18 +353,22 @@ def build(real):
             here = ends[c]
             ends[c] = total
             total += here
-        begin = slot * (count + 1)
+        stride = count + _LANES + 1
         for i in range(count):
             at = (slot * count + i) * 3
             c = cell[slot * count + i]
             kept = c >= 0
             c = ti.select(kept, c, first)
-            target = begin + ti.select(kept, ends[c], count)
+            target = ti.select(kept, ends[c], stride - 1)
             ends[c] += ti.select(kept, 1, 0)
-            order[target] = i
-            packed[target * 3] = image[at] - low_u
-            packed[target * 3 + 1] = (image[at + 1] - low_v) * aspect
-            packed[target * 3 + 2] = image[at + 2]
+            order[slot * stride + target] = i
+            packed[slot * stride * 3 + target] = image[at] - low_u
+            packed[slot * stride * 3 + stride + target] = (image[at + 1] - low_v) * aspect
+            packed[slot * stride * 3 + stride * 2 + target] = image[at + 2]
+        for k in range(3):  # the last register is filled up with the last point
+            for rest in range(total, ti.select(total > 0, total + _LANES, total)):
+                at = (slot * 3 + k) * stride
+                packed[at + rest] = packed[at + total - 1]
         return total
 
     @ti.func
@@ -431,16 +440,14 @@ def build(real):
                             real(DEEP) * spacing,
                         )
                     first = slot * (8 * count + 32)
-                    last = slot * (count + 1) + remaining - 1
+                    stride = count + _LANES + 1
+                    xs = slot * stride * 3
+                    ys, ws = xs + stride, xs + stride * 2
                     for tile in range((remaining + _LANES - 1) // _LANES):
-                        begin = slot * (count + 1) + tile * _LANES
-                        x = ti.Vector([packed[ti.min(begin + s, last) * 3] for s in ti.static(range(_LANES))])
-                        y = ti.Vector(
-                            [packed[ti.min(begin + s, last) * 3 + 1] for s in ti.static(range(_LANES))]
-                        )
-                        w = ti.Vector(
-                            [packed[ti.min(begin + s, last) * 3 + 2] for s in ti.static(range(_LANES))]
-                        )
+                        begin = tile * _LANES
+                        x = ti.Vector([packed[xs + begin + s] for s in ti.static(range(_LANES))])
+                        y = ti.Vector([packed[ys + begin + s] for s in ti.static(range(_LANES))])
+                        w = ti.Vector([packed[ws + begin + s] for s in ti.static(range(_LANES))])
                         # Eight vectors by name: a matrix would not stay in registers.
                         none = ti.Vector([real(-1.0) for _ in ti.static(range(_LANES))])
                         c0, c1, c2, c3, c4, c5, c6, c7 = none, none, none, none, none, none, none, none
@@ -450,36 +457,44 @@ def build(real):
                         bottom = ti.min(ti.cast((y.max() + reach) * per_side, ti.i32) + 1, down - 2)
                         for row in range(top, bottom + 1):
                             # A row of cells is one run of points; a cell begins where the one before it ends.
-                            run = slot * (count + 1)
-                            start = run + cells[first + row * across + left - 1]
-                            for j in range(start, run + cells[first + row * across + right]):
-                                dx = packed[j * 3] - x
-                                dy = packed[j * 3 + 1] - y
-                                gap = w - packed[j * 3 + 2]
+                            start = cells[first + row * across + left - 1]
+                            for j in range(start, cells[first + row * across + right]):
+                                dx = packed[xs + j] - x
+                                dy = packed[ys + j] - y
+                                gap = w - packed[ws + j]
                                 d = dx * dx + dy * dy
-                                whole = d + gap * gap
-                                near = (d <= reach * reach) & (whole > 0)
-                                # Squared cosine between the view's axis and the way to the neighbour, signed.
-                                rise = gap * ti.abs(gap) / ti.max(whole, real(1e-30))
-                                rise = ti.select(near, rise, real(-1.0))
-                                sector = octant(dx, dy)
-                                c0 = raised(c0, rise, sector == 0)
-                                c1 = raised(c1, rise, sector == 1)
-                                c2 = raised(c2, rise, sector == 3)
-                                c3 = raised(c3, rise, sector == 2)
-                                c4 = raised(c4, rise, sector == 6)
-                                c5 = raised(c5, rise, sector == 7)
-                                c6 = raised(c6, rise, sector == 5)
-                                c7 = raised(c7, rise, sector == 4)
+                                # Squared cosine between the view's axis and the way to the neighbour, signed; with
+                                # `tiny` it is -1, no horizon, for the point itself.
+                                tiny = real(1e-30)
+                                rise = (gap * ti.abs(gap) - tiny) / (d + gap * gap + tiny)
+                                rise = ti.select(d <= reach * reach, rise, real(-1.0))
+                                # One sector takes the height, the others nothing.
+                                steep, left_of, above = ti.abs(dy) > ti.abs(dx), dx < 0, dy < 0
+                                steep_any, flat_any = (
+                                    ti.select(steep, rise, none),
+                                    ti.select(steep, none, rise),
+                                )
+                                steep_left, steep_right = (
+                                    ti.select(left_of, steep_any, none),
+                                    ti.select(left_of, none, steep_any),
+                                )
+                                flat_left, flat_right = (
+                                    ti.select(left_of, flat_any, none),
+                                    ti.select(left_of, none, flat_any),
+                                )
+                                c0 = higher(ti.select(above, none, flat_right), c0)
+                                c1 = higher(ti.select(above, none, steep_right), c1)
+                                c2 = higher(ti.select(above, none, steep_left), c2)
+                                c3 = higher(ti.select(above, none, flat_left), c3)
+                                c4 = higher(ti.select(above, flat_left, none), c4)
+                                c5 = higher(ti.select(above, steep_left, none), c5)
+                                c6 = higher(ti.select(above, steep_right, none), c6)
+                                c7 = higher(ti.select(above, flat_right, none), c7)
                         score = judge(filters, c0, c1, c2, c3, c4, c5, c6, c7)
                         for s in ti.static(range(_LANES)):
-                            if begin + s <= last:
-                                visible[view * count + order[begin + s]] = ti.cast(score[s] <= limit, ti.u8)
-
-    @ti.func
-    def raised(horizon, rise, here):
-        value = ti.select(here, rise, real(-1.0))
-        return ti.select(value > horizon, value, horizon)
+                            if begin + s < remaining:
+                                i = order[slot * stride + begin + s]
+                                visible[view * count + i] = ti.cast(score[s] <= limit, ti.u8)
 
     @ti.func
     def judge(filters: ti.template(), c0, c1, c2, c3, c4, c5, c6, c7):
