@@ -109,6 +109,17 @@ def check_finite(function: str, name: str, value: Tensor, lengths: Tensor | None
         )
 
 
+def check_sets(
+    function: str, a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, *, smallest: int
+) -> None:
+    """What two batches of sets must hold, read from their values: lengths in range, and finite coordinates."""
+    for name, cloud, lengths in (("a", a, a_lengths), ("b", b, b_lengths)):
+        if cloud.shape[1] < smallest:
+            raise fail(function, name, "hold at least one point", str(tuple(cloud.shape)))
+        check_lengths_range(function, f"{name}_lengths", lengths, cloud.shape[1], smallest)
+        check_finite(function, name, cloud, lengths)
+
+
 def check_clouds(function: str, name: str, value: Any) -> Tensor:
     """A batch of clouds (B, N, 3)."""
     return check_tensor(function, name, value, ("B", "N", 3))

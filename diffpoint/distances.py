@@ -83,9 +83,6 @@ def chamfer_distance(
         [1.0, 3.0]
     """
     a3, b3, la, lb, batch = paired_sets("chamfer_distance", a, b, a_lengths, b_lengths)
-    for name, cloud in (("a", a3), ("b", b3)):
-        if cloud.shape[1] == 0:
-            raise _checks.fail("chamfer_distance", name, "hold at least one point", str(tuple(cloud.shape)))
     a_to_b = _mean_distance(_nearest(a3, b3, la, lb, "chamfer_distance", 1)[0], la, squared)
     b_to_a = _mean_distance(_nearest(b3, a3, lb, la, "chamfer_distance", 1)[0], lb, squared)
     return Chamfer(a_to_b.reshape(batch), b_to_a.reshape(batch))
@@ -143,9 +140,7 @@ def _nearest_gradient(ctx, grad_squared_distance: Tensor, _grad_index):
 def _nearest(
     a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, caller: str, smallest: int
 ) -> tuple[Tensor, Tensor]:
-    for name, cloud, lengths in (("a", a, a_lengths), ("b", b, b_lengths)):
-        _checks.check_lengths_range(caller, f"{name}_lengths", lengths, cloud.shape[1], smallest)
-        _checks.check_finite(caller, name, cloud, lengths)
+    _checks.check_sets(caller, a, b, a_lengths, b_lengths, smallest=smallest)
     squared_distance = a.new_empty(a.shape[:2])
     index = a.new_empty(a.shape[:2], dtype=torch.int64)
     if b.shape[1] == 0:

@@ -42,9 +42,6 @@ def approxmatch(
     """
     name = "approxmatch"
     a3, b3, la, lb, batch = paired_sets(name, a, b, a_lengths, b_lengths)
-    for label, cloud in (("a", a3), ("b", b3)):
-        if cloud.shape[1] == 0:
-            raise _checks.fail(name, label, "hold at least one point", str(tuple(cloud.shape)))
     with_gradient = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
     return _approxmatch(a3, b3, la, lb, with_gradient)[0].reshape(batch)
 
@@ -68,9 +65,7 @@ def _approxmatch(
     a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, with_gradient: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The cost, and its gradients to `a` and `b` for a unit gradient (zeros unless asked for)."""
-    for name, cloud, lengths in (("a", a, a_lengths), ("b", b, b_lengths)):
-        _checks.check_lengths_range("approxmatch", f"{name}_lengths", lengths, cloud.shape[1], 1)
-        _checks.check_finite("approxmatch", name, cloud, lengths)
+    _checks.check_sets("approxmatch", a, b, a_lengths, b_lengths, smallest=1)
     count, n, m = a.shape[0], a.shape[1], b.shape[1]
     cost = torch.zeros(count, dtype=torch.float64)
     if count == 0:

@@ -71,9 +71,6 @@ def earth_mover_distance(
     """
     name = "earth_mover_distance"
     a3, b3, la, lb, batch = paired_sets(name, a, b, a_lengths, b_lengths)
-    for label, cloud in (("a", a3), ("b", b3)):
-        if cloud.shape[1] == 0:
-            raise _checks.fail(name, label, "hold at least one point", str(tuple(cloud.shape)))
     if not 0 < tolerance < 1:
         raise _checks.fail(name, "tolerance", "lie between 0 and 1", repr(tolerance))
     cost, assignment, bound, converged = _transport(a3, b3, la, lb, float(tolerance))
@@ -109,9 +106,7 @@ def _transport_gradient(ctx, grad_cost: Tensor, *_grads):
 def _transport(
     a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, tolerance: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    for name, cloud, lengths in (("a", a, a_lengths), ("b", b, b_lengths)):
-        _checks.check_lengths_range("earth_mover_distance", f"{name}_lengths", lengths, cloud.shape[1], 1)
-        _checks.check_finite("earth_mover_distance", name, cloud, lengths)
+    _checks.check_sets("earth_mover_distance", a, b, a_lengths, b_lengths, smallest=1)
     count, n, m = a.shape[0], a.shape[1], b.shape[1]
     bound = torch.zeros(count, dtype=torch.float64)
     finished = torch.ones(count, dtype=torch.uint8)

@@ -49,3 +49,34 @@ def test_a_second_derivative_is_refused(function):
     (gradient,) = torch.autograd.grad(function(a, b), a, create_graph=True)
     with pytest.raises(RuntimeError, match=r"diffpoint\.\w+_backward.* no autograd formula"):
         gradient.square().sum().backward()
+
+
+CAMERA = dp.PinholeCamera.look_at(
+    torch.tensor([[0.0, 0, -2], [2, 0.3, 0]]), focal_px=30.0, height=16, width=14
+)
+
+
+def through_the_layer(points: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """Splat, sample (a size that depends on the data) and compare."""
+    splat = dp.splat_depth(points, CAMERA)
+    seen = dp.sample_view(points, splat).points
+    chamfer = dp.chamfer_distance(seen.flatten(1, 2), truth, squared=False)
+    return chamfer.a_to_b.mean() + chamfer.b_to_a.mean() + splat.depth.clamp(max=5).mean()
+
+
+def test_the_layer_compiles_into_one_graph_and_exports():
+    generator = torch.Generator().manual_seed(0)
+    points = (torch.rand(2, 60, 3, generator=generator) - 0.5).requires_grad_()
+    truth = torch.rand(2, 50, 3, generator=generator) - 0.5
+    plain = through_the_layer(points, truth)
+    compiled = torch.compile(through_the_layer, fullgraph=True, backend="aot_eager")(points, truth)
+    assert torch.allclose(plain, compiled)
+    for x, y in zip(torch.autograd.grad(plain, points), torch.autograd.grad(compiled, points), strict=True):
+        assert torch.allclose(x, y, atol=1e-6)
+
+    class Layer(torch.nn.Module):
+        def forward(self, points, truth):
+            return through_the_layer(points, truth)
+
+    exported = torch.export.export(Layer(), (points.detach(), truth)).module()
+    assert torch.allclose(exported(points.detach(), truth), plain)
