@@ -137,11 +137,12 @@ def _visible(
     if method == "horizon":
         kernel, last = "horizon", _limit(tolerance)
         filters = torch.tensor(FILTERS, dtype=points.dtype).view(-1)
+        row = count + 17  # a register's worth of padding, and a place for what is left out
         scratch = (
             torch.empty(workers * count, dtype=torch.int32),
             points.new_empty(cells.shape),
-            torch.empty(workers * (count + 17), dtype=torch.int32),
-            points.new_empty(workers * (count + 17) * 3),
+            torch.empty(workers * row, dtype=torch.int32),
+            points.new_empty(workers * row * 3),
             filters,
         )
     else:

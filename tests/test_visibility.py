@@ -215,6 +215,14 @@ def test_sample_view_and_the_front_constraint_take_any_visibility():
     assert better < paper  # the far side, which the z-buffer lets through, is far from the truth
 
 
+@pytest.mark.parametrize("method", KERNELS)
+def test_the_operator_passes_opcheck(method):
+    camera, points = cameras(torch.float32), spheres(50, torch.float32)
+    lengths = torch.tensor([50, 20])
+    arguments = (points, lengths, camera.projection, HEIGHT, WIDTH, method, 2.0, 0.3)
+    torch.library.opcheck(torch.ops.diffpoint.visible.default, arguments)
+
+
 def test_sample_view_refuses_flags_that_are_none():
     points = spheres(10, torch.float32)
     with pytest.raises(
