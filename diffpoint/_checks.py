@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from diffpoint.camera import PinholeCamera
+from torch import Tensor
 
 FLOATS = (torch.float32, torch.float64)
 
@@ -123,21 +119,6 @@ def check_sets(
 def check_clouds(function: str, name: str, value: Any) -> Tensor:
     """A batch of clouds (B, N, 3)."""
     return check_tensor(function, name, value, ("B", "N", 3))
-
-
-def check_views(function: str, name: str, camera: PinholeCamera, batch: int) -> PinholeCamera:
-    """The camera with batch shape (batch, V): () and (V,) are shared by all clouds."""
-    shape = camera.batch_shape
-    if len(shape) > 2 or (len(shape) == 2 and shape[0] not in (1, batch)):
-        raise fail(
-            function,
-            name,
-            f"have batch shape (), (V,), (1, V) or ({batch}, V)",
-            str(tuple(shape)),
-            "One row of cameras per cloud.",
-        )
-    views = shape[-1] if shape else 1
-    return camera.expand(batch, views)
 
 
 def check_choice(function: str, name: str, value: str, choices: tuple[str, ...]) -> None:

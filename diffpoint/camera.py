@@ -225,6 +225,27 @@ def _vector(name: str, value, like: Tensor | None = None) -> Tensor:
     return value if like is None else value.to(like.dtype)
 
 
+def check_views(function: str, name: str, camera: PinholeCamera, like: Tensor) -> PinholeCamera:
+    """The camera with batch shape (B, V), for B clouds or groups of maps `like`: () and (V,) are shared by all."""
+    if not isinstance(camera, PinholeCamera):
+        raise TypeError(f"{function}: '{name}' must be a PinholeCamera; got {type(camera).__name__}.")
+    if camera.dtype != like.dtype:
+        raise TypeError(
+            f"{function}: '{name}' must have the dtype of the points ({like.dtype}); got {camera.dtype}. "
+            f"Convert it with {name}.to({like.dtype})."
+        )
+    batch, shape = like.shape[0], camera.batch_shape
+    if len(shape) > 2 or (len(shape) == 2 and shape[0] not in (1, batch)):
+        raise _checks.fail(
+            function,
+            name,
+            f"have batch shape (), (V,), (1, V) or ({batch}, V)",
+            str(tuple(shape)),
+            "One row of cameras per cloud.",
+        )
+    return camera.expand(batch, shape[-1] if shape else 1)
+
+
 class Projection(NamedTuple):
     """Image positions and depths of points."""
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
-from diffpoint.camera import PinholeCamera, PointSets, Projection
+from diffpoint.camera import PinholeCamera, PointSets, Projection, check_views
 
 
 class Reprojection(NamedTuple):
@@ -45,8 +45,7 @@ def project(points: Tensor, camera: PinholeCamera) -> Projection:
         [[[[2.0, 2.0]]]]
     """
     _checks.check_clouds("project", "points", points)
-    _checks.check_same_dtype("project", points=points, camera=camera.K)
-    views = _checks.check_views("project", "camera", camera, points.shape[0])
+    views = check_views("project", "camera", camera, points)
     return Projection(*_project(points, views.projection, "project"))
 
 
@@ -93,9 +92,8 @@ def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Re
         [[[[[0.5, 0.5]]]]]
     """
     views = _depth_views("reproject", depth, "source", source)
-    _checks.check_same_dtype("reproject", depth=depth, target=target.K)
     batch, count, height, width = depth.shape
-    targets = _checks.check_views("reproject", "target", target, batch)
+    targets = check_views("reproject", "target", target, depth)
     if targets.batch_shape[1] not in (1, count):
         raise _checks.fail(
             "reproject", "target", f"have {count} views to match 'depth'", str(targets.batch_shape[1])
@@ -122,7 +120,6 @@ def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Re
 def _depth_views(function: str, depth: Tensor, name: str, camera: PinholeCamera) -> PinholeCamera:
     """The camera expanded to the (B, V) of the depth maps, of their size and dtype."""
     _checks.check_tensor(function, "depth", depth, ("B", "V", "H", "W"))
-    _checks.check_same_dtype(function, depth=depth, **{name: camera.K})
     batch, count, height, width = depth.shape
     if (height, width) != (camera.height, camera.width):
         raise _checks.fail(
@@ -132,7 +129,7 @@ def _depth_views(function: str, depth: Tensor, name: str, camera: PinholeCamera)
             f"{height} x {width}",
             "Use camera.resize(height, width) if the map shows the same view at another size.",
         )
-    views = _checks.check_views(function, name, camera, batch)
+    views = check_views(function, name, camera, depth)
     if views.batch_shape[1] not in (1, count):
         raise _checks.fail(function, name, f"have {count} views to match 'depth'", str(views.batch_shape[1]))
     return views.expand(batch, count)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
-from diffpoint.camera import PinholeCamera
+from diffpoint.camera import PinholeCamera, check_views
 
 
 class Splat(NamedTuple):
@@ -52,12 +52,11 @@ def splat_depth(
         [[[False, True]]]
     """
     _checks.check_clouds("splat_depth", "points", points)
-    _checks.check_same_dtype("splat_depth", points=points, camera=camera.K)
     if not radius >= 0 or radius == float("inf"):
         raise _checks.fail("splat_depth", "radius", "be a finite number of pixels, at least 0", repr(radius))
     batch = points.shape[0]
     lengths = _checks.check_lengths("splat_depth", "lengths", lengths, (batch,), points.shape[1])
-    views = _checks.check_views("splat_depth", "camera", camera, batch)
+    views = check_views("splat_depth", "camera", camera, points)
     lengths = _bridge.full_lengths(lengths, batch, points.shape[1])
     return Splat(*_splat(points, lengths, views.projection, camera.height, camera.width, float(radius)))
 

@@ -12,8 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from diffpoint import _checks
-from diffpoint.camera import PinholeCamera
+from diffpoint.camera import PinholeCamera, check_views
 
 # One tolerance per dtype, relative to the size of the values: sums of a few thousand terms stay below it.
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-11}
@@ -41,7 +40,9 @@ def tie_free_clouds(
         torch.Size([2, 20, 3])
     """
     generator = torch.Generator().manual_seed(seed)
-    views = _checks.check_views("tie_free_clouds", "camera", camera.to(torch.float64), batch)
+    views = check_views(
+        "tie_free_clouds", "camera", camera.to(torch.float64), torch.empty(batch, 0, 3, dtype=torch.float64)
+    )
     clouds = []
     for cloud in range(batch):
         points = torch.rand(8 * count, 3, dtype=torch.float64, generator=generator) - 0.5
@@ -69,7 +70,7 @@ def boundary_points(points: Tensor, camera: PinholeCamera, *, margin: float = 1e
         >>> boundary_points(torch.tensor([[[0.0, 0.0, 0.0], [0.25, 0.25, 0.0]]]), camera).tolist()
         [[[True, False]]]
     """
-    projection = _checks.check_views("boundary_points", "camera", camera, points.shape[0]).projection
+    projection = check_views("boundary_points", "camera", camera, points).projection
     ones = torch.ones_like(points[..., :1])
     homogeneous = torch.cat((points, ones), -1)[:, None] @ projection.mT
     depth = homogeneous[..., 2]

@@ -11,7 +11,7 @@ from torch import Tensor
 from diffpoint import _bridge, _checks
 from diffpoint._horizon import BIAS, FILTERS, REACH
 from diffpoint._runtime import runtime_info
-from diffpoint.camera import PinholeCamera
+from diffpoint.camera import PinholeCamera, check_views
 from diffpoint.splat import splat_depth
 
 Method = Literal["zbuffer", "radius", "pyramid", "cone", "horizon", "hpr"]
@@ -80,14 +80,13 @@ def visible_points(
         [[[False, True]]]
     """
     _checks.check_clouds("visible_points", "points", points)
-    _checks.check_same_dtype("visible_points", points=points, camera=camera.K)
     _checks.check_choice("visible_points", "method", method, tuple(_DEFAULTS))
     for name, value in (("radius", radius), ("tolerance", tolerance)):
         if value is not None and not 0 <= value < math.inf:
             raise _checks.fail("visible_points", name, "be a finite number, at least 0", repr(value))
     batch, count = points.shape[:2]
     lengths = _checks.check_lengths("visible_points", "lengths", lengths, (batch,), count)
-    views = _checks.check_views("visible_points", "camera", camera, batch)
+    views = check_views("visible_points", "camera", camera, points)
     if method == "zbuffer":
         return splat_depth(points.detach(), camera, lengths=lengths).visible
     own_radius, own_tolerance = _DEFAULTS[method]
