@@ -145,6 +145,12 @@ def test_batches_that_do_not_match():
         dp.sample_view(torch.rand(2, 9, 3), splat.depth)
 
 
+@pytest.mark.parametrize("op", [dp.splat_depth, dp.project, dp.visible_points])
+def test_what_is_no_camera(op):
+    with pytest.raises(TypeError, match=r"'camera' must be a PinholeCamera; got Tensor"):
+        op(torch.rand(2, 5, 3), torch.eye(3))
+
+
 def test_options_out_of_range():
     points = torch.rand(2, 5, 3)
     for call, message in (
