@@ -153,12 +153,15 @@ def _project_gradient(ctx, grad_pixels: Tensor, grad_depth: Tensor):
 def _project(points: Tensor, projection: Tensor, caller: str) -> tuple[Tensor, Tensor]:
     _checks.check_finite(caller, "points", points)
     batch, views = projection.shape[:2]
-    pixels = points.new_empty((batch * views, points.shape[1], 2))
-    depth = points.new_empty((batch * views, points.shape[1]))
+    count = points.shape[1]
+    pixels = points.new_empty((batch, views, count, 2))
+    depth = points.new_empty((batch, views, count))
     if depth.numel():
-        cameras = projection.reshape(batch * views, 12)
-        _bridge.launch("reproject", "project", points.dtype, points, cameras, pixels, depth, views)
-    return pixels.view(batch, views, points.shape[1], 2), depth.view(batch, views, points.shape[1])
+        inputs = points.reshape(-1), projection.reshape(-1)
+        _bridge.launch(
+            "reproject", "project", points.dtype, *inputs, pixels.view(-1), depth.view(-1), views, count
+        )
+    return pixels, depth
 
 
 @_bridge.register(
@@ -171,24 +174,14 @@ def _project(points: Tensor, projection: Tensor, caller: str) -> tuple[Tensor, T
 def _project_backward(
     points: Tensor, projection: Tensor, grad_pixels: Tensor, grad_depth: Tensor
 ) -> tuple[Tensor, Tensor]:
-    batch, views = projection.shape[:2]
-    flat, count = batch * views, points.shape[1]
+    views, count = projection.shape[1], points.shape[1]
     grad_points = points.new_zeros(points.shape)
-    grad_projection = projection.new_zeros((flat, 12))
-    if points.numel() and flat:
-        _bridge.launch(
-            "reproject",
-            "project_backward",
-            points.dtype,
-            points,
-            projection.reshape(flat, 12),
-            grad_pixels.reshape(flat, count, 2),
-            grad_depth.reshape(flat, count),
-            grad_points,
-            grad_projection,
-            views,
-        )
-    return grad_points, grad_projection.view(batch, views, 3, 4)
+    grad_projection = projection.new_zeros(projection.shape)
+    if points.numel() and projection.numel():
+        inputs = points.reshape(-1), projection.reshape(-1), grad_pixels.reshape(-1), grad_depth.reshape(-1)
+        outputs = grad_points.view(-1), grad_projection.view(-1)
+        _bridge.launch("reproject", "project_backward", points.dtype, *inputs, *outputs, views, count)
+    return grad_points, grad_projection
 
 
 def _unproject_fake(depth: Tensor, back_projection: Tensor, compact: bool, caller: str):

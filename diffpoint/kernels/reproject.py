@@ -10,72 +10,78 @@ def build(real):
     maps3 = ti.types.ndarray(dtype=real, ndim=3)
     matrices2 = ti.types.ndarray(dtype=real, ndim=2)
     integers = ti.types.ndarray(dtype=ti.i64, ndim=1)
-    values2 = ti.types.ndarray(dtype=real, ndim=2)
+    reals = ti.types.ndarray(dtype=real, ndim=1)
 
     @ti.kernel
     def project(
-        points: points3, projection: matrices2, pixels: points3, depth: values2, views: ti.i32, spread: ti.i32
+        points: reals,
+        projection: reals,
+        pixels: reals,
+        depth: reals,
+        views: ti.i32,
+        count: ti.i32,
+        spread: ti.i32,
     ):
-        for step in range(projection.shape[0] * spread):
+        for step in range(projection.shape[0] // 12 * spread):
             if step % spread == 0:
                 view = step // spread
                 cloud = view // views
-                m = ti.Vector([projection[view, e] for e in ti.static(range(12))])
-                for i in range(points.shape[1]):
-                    x = points[cloud, i, 0]
-                    y = points[cloud, i, 1]
-                    z = points[cloud, i, 2]
+                m = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
+                for i in range(count):
+                    source = (cloud * count + i) * 3
+                    x = points[source]
+                    y = points[source + 1]
+                    z = points[source + 2]
                     d = m[8] * x + m[9] * y + m[10] * z + m[11]
-                    u = real(ti.math.inf)
-                    v = real(ti.math.inf)
-                    if d > 0:
-                        inverse = real(1.0) / d  # as in the splat, so that both put a point in the same pixel
-                        u = (m[0] * x + m[1] * y + m[2] * z + m[3]) * inverse
-                        v = (m[4] * x + m[5] * y + m[6] * z + m[7]) * inverse
-                    pixels[view, i, 0] = u
-                    pixels[view, i, 1] = v
-                    depth[view, i] = d
+                    inverse = real(1.0) / d  # as in the splat, so that both put a point in the same pixel
+                    u = (m[0] * x + m[1] * y + m[2] * z + m[3]) * inverse
+                    v = (m[4] * x + m[5] * y + m[6] * z + m[7]) * inverse
+                    target = view * count + i
+                    pixels[2 * target] = ti.select(d > 0, u, real(ti.math.inf))
+                    pixels[2 * target + 1] = ti.select(d > 0, v, real(ti.math.inf))
+                    depth[target] = d
 
     @ti.kernel
     def project_backward(
-        points: points3,
-        projection: matrices2,
-        grad_pixels: points3,
-        grad_depth: values2,
-        grad_points: points3,
-        grad_projection: matrices2,
+        points: reals,
+        projection: reals,
+        grad_pixels: reals,
+        grad_depth: reals,
+        grad_points: reals,
+        grad_projection: reals,
         views: ti.i32,
+        count: ti.i32,
         spread: ti.i32,
     ):
-        for step in range(points.shape[0] * spread):
+        for step in range(points.shape[0] // (3 * count) * spread):
             if step % spread == 0:
                 cloud = step // spread
                 for view in range(cloud * views, cloud * views + views):
-                    m = ti.Vector([projection[view, e] for e in ti.static(range(12))])
+                    m = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
                     total = ti.Vector([real(0.0) for e in ti.static(range(12))])
-                    for i in range(points.shape[1]):
-                        p = ti.Vector(
-                            [points[cloud, i, 0], points[cloud, i, 1], points[cloud, i, 2], real(1.0)]
-                        )
-                        d = m[8] * p[0] + m[9] * p[1] + m[10] * p[2] + m[11]
+                    for i in range(count):
+                        source = (cloud * count + i) * 3
+                        target = view * count + i
+                        x = points[source]
+                        y = points[source + 1]
+                        z = points[source + 2]
+                        d = m[8] * x + m[9] * y + m[10] * z + m[11]
                         # Gradients of the three rows' products with (x, y, z, 1): (u d, v d, d).
-                        g0 = real(0.0)
-                        g1 = real(0.0)
-                        g2 = grad_depth[view, i]
-                        if d > 0:
-                            u = (m[0] * p[0] + m[1] * p[1] + m[2] * p[2] + m[3]) / d
-                            v = (m[4] * p[0] + m[5] * p[1] + m[6] * p[2] + m[7]) / d
-                            g0 = grad_pixels[view, i, 0] / d
-                            g1 = grad_pixels[view, i, 1] / d
-                            g2 -= g0 * u + g1 * v
+                        inverse = real(1.0) / ti.select(d > 0, d, real(1.0))
+                        g0 = ti.select(d > 0, grad_pixels[2 * target] * inverse, real(0.0))
+                        g1 = ti.select(d > 0, grad_pixels[2 * target + 1] * inverse, real(0.0))
+                        u = (m[0] * x + m[1] * y + m[2] * z + m[3]) * inverse
+                        v = (m[4] * x + m[5] * y + m[6] * z + m[7]) * inverse
+                        g2 = grad_depth[target] - g0 * u - g1 * v
                         for k in ti.static(range(3)):
-                            grad_points[cloud, i, k] += g0 * m[k] + g1 * m[4 + k] + g2 * m[8 + k]
+                            grad_points[source + k] += g0 * m[k] + g1 * m[4 + k] + g2 * m[8 + k]
+                        p = ti.Vector([x, y, z, real(1.0)])
                         for k in ti.static(range(4)):
                             total[k] += g0 * p[k]
                             total[4 + k] += g1 * p[k]
                             total[8 + k] += g2 * p[k]
                     for e in ti.static(range(12)):
-                        grad_projection[view, e] = total[e]
+                        grad_projection[view * 12 + e] = total[e]
 
     @ti.kernel
     def unproject(
