@@ -225,8 +225,13 @@ def _vector(name: str, value, like: Tensor | None = None) -> Tensor:
     return value if like is None else value.to(like.dtype)
 
 
-def check_views(function: str, name: str, camera: PinholeCamera, like: Tensor) -> PinholeCamera:
-    """The camera with batch shape (B, V), for B clouds or groups of maps `like`: () and (V,) are shared by all."""
+def check_views(
+    function: str, name: str, camera: PinholeCamera, like: Tensor, *, views: int | None = None
+) -> PinholeCamera:
+    """The camera with batch shape (B, V), for B clouds or groups of maps `like`: () and (V,) are shared by all.
+
+    With `views`, the number of depth maps of a group: it must have that many, or one for all of them.
+    """
     if not isinstance(camera, PinholeCamera):
         raise TypeError(f"{function}: '{name}' must be a PinholeCamera; got {type(camera).__name__}.")
     if camera.dtype != like.dtype:
@@ -243,7 +248,10 @@ def check_views(function: str, name: str, camera: PinholeCamera, like: Tensor) -
             str(tuple(shape)),
             "One row of cameras per cloud.",
         )
-    return camera.expand(batch, shape[-1] if shape else 1)
+    own = shape[-1] if shape else 1
+    if views is not None and own not in (1, views):
+        raise _checks.fail(function, name, f"have {views} views to match 'depth'", str(own))
+    return camera.expand(batch, own if views is None else views)
 
 
 class Projection(NamedTuple):

@@ -273,9 +273,7 @@ def _check_maps(function: str, points: Tensor, camera: PinholeCamera, depth: Ten
     _checks.check_clouds(function, "points", points)
     _checks.check_tensor(function, "depth", depth, (points.shape[0], "V", camera.height, camera.width))
     _checks.check_same_dtype(function, points=points, depth=depth)
-    views = check_views(function, "camera", camera, points).batch_shape[1]
-    if views not in (1, depth.shape[1]):
-        raise _checks.fail(function, "camera", f"have {depth.shape[1]} views to match 'depth'", str(views))
+    check_views(function, "camera", camera, points, views=depth.shape[1])
     return points.shape[0], depth.shape[1]
 
 

@@ -93,12 +93,7 @@ def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Re
     """
     views = _depth_views("reproject", depth, "source", source)
     batch, count, height, width = depth.shape
-    targets = check_views("reproject", "target", target, depth)
-    if targets.batch_shape[1] not in (1, count):
-        raise _checks.fail(
-            "reproject", "target", f"have {count} views to match 'depth'", str(targets.batch_shape[1])
-        )
-    targets = targets.expand(batch, count)
+    targets = check_views("reproject", "target", target, depth, views=count)
     points, _ = _unproject(depth, views.back_projection, False, "reproject")
     flat = batch * count
     pixels, seen_depth = _project(
@@ -120,7 +115,7 @@ def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Re
 def _depth_views(function: str, depth: Tensor, name: str, camera: PinholeCamera) -> PinholeCamera:
     """The camera expanded to the (B, V) of the depth maps, of their size and dtype."""
     _checks.check_tensor(function, "depth", depth, ("B", "V", "H", "W"))
-    batch, count, height, width = depth.shape
+    _, count, height, width = depth.shape
     if (height, width) != (camera.height, camera.width):
         raise _checks.fail(
             function,
@@ -129,10 +124,7 @@ def _depth_views(function: str, depth: Tensor, name: str, camera: PinholeCamera)
             f"{height} x {width}",
             "Use camera.resize(height, width) if the map shows the same view at another size.",
         )
-    views = check_views(function, name, camera, depth)
-    if views.batch_shape[1] not in (1, count):
-        raise _checks.fail(function, name, f"have {count} views to match 'depth'", str(views.batch_shape[1]))
-    return views.expand(batch, count)
+    return check_views(function, name, camera, depth, views=count)
 
 
 def _project_fake(points: Tensor, projection: Tensor, caller: str):

@@ -50,6 +50,20 @@ def build(real):
         """start, start + 1, start - 1, start + 2, ..."""
         return start + ti.select(turn % 2 == 1, (turn + 1) // 2, -(turn // 2))
 
+    @ti.func
+    def scan_box(b: ti.template(), b_order: ti.template(), cloud, box, m, here: ti.template(), best, best_j):
+        """The nearer of what was found before and the points of a box; of equals the one that came first unsorted."""
+        for j in range(box * BLOCK, ti.min(box * BLOCK + BLOCK, m)):
+            dx = b[cloud, j, 0] - here[0]
+            dy = b[cloud, j, 1] - here[1]
+            dz = b[cloud, j, 2] - here[2]
+            d = dx * dx + dy * dy + dz * dz
+            source = b_order[cloud, j]
+            closer = (d < best) | ((d == best) & (source < best_j))
+            best_j = ti.select(closer, source, best_j)
+            best = ti.select(closer, d, best)
+        return best, best_j
+
     @ti.kernel
     def forward(
         a: clouds,
@@ -202,30 +216,16 @@ def build(real):
                                 box = ti.select(r == s, winner[r], box)
                                 ties = ti.select(r == s, tied[r], ties)
                             here = ti.Vector([a[cloud, first + s, k] for k in ti.static(range(3))])
-                            best = real(largest)
-                            best_j = b_order[cloud, box * BLOCK]
-                            for j in range(box * BLOCK, ti.min(box * BLOCK + BLOCK, m)):
-                                dx = b[cloud, j, 0] - here[0]
-                                dy = b[cloud, j, 1] - here[1]
-                                dz = b[cloud, j, 2] - here[2]
-                                d = dx * dx + dy * dy + dz * dz
-                                source = b_order[cloud, j]
-                                closer = (d < best) | ((d == best) & (source < best_j))
-                                best_j = ti.select(closer, source, best_j)
-                                best = ti.select(closer, d, best)
+                            best, best_j = scan_box(
+                                b, b_order, cloud, box, m, here, real(largest), b_order[cloud, box * BLOCK]
+                            )
                             if ties != 0:
                                 # Equally near in several boxes: the lowest index of them all, as without boxes.
                                 for other in range(boxes):
                                     if apart(b_boxes, cloud, other, here, here) <= best:
-                                        for j in range(other * BLOCK, ti.min(other * BLOCK + BLOCK, m)):
-                                            dx = b[cloud, j, 0] - here[0]
-                                            dy = b[cloud, j, 1] - here[1]
-                                            dz = b[cloud, j, 2] - here[2]
-                                            d = dx * dx + dy * dy + dz * dz
-                                            source = b_order[cloud, j]
-                                            closer = (d < best) | ((d == best) & (source < best_j))
-                                            best_j = ti.select(closer, source, best_j)
-                                            best = ti.select(closer, d, best)
+                                        best, best_j = scan_box(
+                                            b, b_order, cloud, other, m, here, best, best_j
+                                        )
                             place = a_order[cloud, first + s]
                             squared_distance[cloud, place] = best
                             index[cloud, place] = best_j
@@ -245,13 +245,10 @@ def build(real):
         grad_b: clouds,
         spread: ti.i32,
     ):
-        # One thread owns one cloud: it scatters without atomics, in a fixed order.
+        # One thread owns one cloud: it scatters without atomics, in a fixed order. Gradients come in as zeros.
         for step in range(a.shape[0] * spread):
             if step % spread == 0:
                 cloud = step // spread
-                for j in range(b.shape[1]):
-                    for k in ti.static(range(3)):
-                        grad_b[cloud, j, k] = real(0.0)
                 for i in range(a.shape[1]):
                     j = ti.cast(index[cloud, i], ti.i32)
                     if j >= 0:
@@ -260,8 +257,5 @@ def build(real):
                             component = g * (a[cloud, i, k] - b[cloud, j, k])
                             grad_a[cloud, i, k] = component
                             grad_b[cloud, j, k] -= component
-                    else:
-                        for k in ti.static(range(3)):
-                            grad_a[cloud, i, k] = real(0.0)
 
     return SimpleNamespace(forward=forward, forward_blocks=forward_blocks, backward=backward)
