@@ -50,6 +50,11 @@ def _read(path: Path) -> Tensor:
     except Exception as error:  # every decoder has its own exceptions; all mean that this is no image
         reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
         raise UserError(f"{path} is not an image that can be read ({reason})") from None
+    return on_white(pixels)
+
+
+def on_white(pixels: np.ndarray) -> Tensor:
+    """Decoded pixels (H, W, 1 to 4), grey or colour with or without alpha, as (3, H, W) in [0, 1]; holes are white."""
     top = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1.0
     values = np.asarray(pixels, np.float32) / np.float32(top)
     if values.shape[2] in (2, 4):

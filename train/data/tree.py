@@ -19,6 +19,7 @@ from diffpoint.io import read_depth, read_points
 from train.data import store
 from train.data.categories import CATEGORY_OF, SYNSET_OF, category_of, synset_of
 from train.errors import UserError
+from train.images import on_white
 
 
 class ShapeError(UserError):
@@ -189,13 +190,7 @@ def _read(shape: str, path: Path, reader):
 
 def _read_image(path: Path) -> Tensor:
     """(3, H, W) in [0, 1]; transparency shows white."""
-    pixels = np.atleast_3d(imageio.imread(path)).astype(np.float32) / 255
-    if pixels.shape[2] in (2, 4):
-        alpha = pixels[..., -1:]
-        pixels = pixels[..., :-1] * alpha + 1 - alpha
-    if pixels.shape[2] == 1:
-        pixels = pixels.repeat(3, axis=2)
-    return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
+    return on_white(np.atleast_3d(imageio.imread(path)))
 
 
 def _camera_file(folder: Path, view: int) -> Path:
