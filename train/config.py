@@ -88,6 +88,16 @@ class InferenceConfig:
     """Gradient steps on the kept codes."""
     step_size: float = 0.5
     """Length factor of a gradient step; the loss is each shape's own mean pair distance x100."""
+    patience: int = 0
+    """A shape's descent stops after so many steps in a row that did not lower its loss; 0: never early."""
+    min_drop: float = 0.0
+    """A loss counts as lower when it falls by more than this (x100)."""
+    keep_best: bool = False
+    """Return each shape's codes with the lowest loss on the way instead of the last ones."""
+    prior: float = 0.0
+    """Weight of |code|^2 / 2 beside the loss: pulls codes back to the N(0, 1) they were drawn from."""
+    keep_norm: bool = False
+    """Rescale every code to its first length after each step, so that it stays as likely under N(0, 1)."""
 
 
 @dataclasses.dataclass(frozen=True)

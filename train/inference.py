@@ -5,6 +5,7 @@ Algorithm 1 of the paper. No camera is needed: every prediction lives in the sam
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import torch
@@ -12,6 +13,11 @@ from torch import Tensor
 
 from diffpoint import consistency_loss
 from models import Generator
+from train.config import InferenceConfig
+
+# Objects are worked on in groups that together predict about so many points: 16 objects in 24 views of the cpu
+# profile, 4 of the full one. The memory of a gradient step then stays near a gigabyte at most.
+_POINTS_AT_ONCE = 200_000
 
 
 class Reconstruction(NamedTuple):
@@ -20,33 +26,43 @@ class Reconstruction(NamedTuple):
     Attributes:
         points: (B, V*N, 3) the concatenated clouds, world frame.
         codes: (B, V, code_dim) the codes that made them.
-        history: (steps + 1, B) consistency loss x100 before every gradient step and after the last; (0, B) when
-            there was nothing to agree on (one view) or nothing to choose (a deterministic network).
+        history: (S + 1, B) consistency loss x100 before the first of S gradient steps and after each; the loss of a
+            shape that has stopped stays what it was. (0, B) when there was nothing to agree on (one view) or nothing
+            to choose (a deterministic network).
+        kept: (B,) int64, the step whose codes are returned: a row of `history`, or 0 where that is empty.
     """
 
     points: Tensor
     codes: Tensor
     history: Tensor
+    kept: Tensor
 
 
 def reconstruct(
     model: Generator,
     images: Tensor,
     *,
-    groups: int = 5,
-    steps: int = 30,
+    groups: int | None = None,
+    steps: int | None = None,
     seed: int = 0,
-    step_size: float = 0.5,
+    step_size: float | None = None,
+    settings: InferenceConfig | None = None,
 ) -> Reconstruction:
-    """Searches `groups` random groups of codes, keeps the most consistent, descends on its codes.
+    """Searches groups of random codes, keeps each object's most consistent one, descends on its codes.
 
     Args:
         model: a generator; its parameters are left alone.
         images: (V, 3, H, W) of one object, or (B, V, 3, H, W) of B objects, in [0, 1] on white.
-        groups: groups of V codes tried per object.
-        steps: plain gradient steps on the kept codes.
+        groups: groups of V codes tried per object; 5 if neither this nor `settings` says otherwise.
+        steps: plain gradient steps on the kept codes; 30 likewise.
         seed: draws the codes.
-        step_size: factor on the gradient of each object's own loss (mean pair chamfer distance x100).
+        step_size: factor on the gradient of each object's own loss (mean pair chamfer distance x100); 0.5 likewise.
+        settings: all of them and more: stopping early, keeping the best, staying near N(0, 1).
+
+    Raises:
+        ValueError: images of another shape, or settings out of range.
+
+    Source: CVPR 2019 paper, Algorithm 1.
 
     Example:
         >>> from models import build_generator
@@ -56,55 +72,110 @@ def reconstruct(
     """
     if images.ndim == 4:
         images = images[None]
-    if images.ndim != 5 or images.shape[2] != 3:
+    if images.ndim != 5 or images.shape[2] != 3 or 0 in images.shape:
         got = tuple(images.shape)
         raise ValueError(f"reconstruct: 'images' must be (V, 3, H, W) or (B, V, 3, H, W); got {got}")
-    if groups < 1 or steps < 0:
-        raise ValueError(f"reconstruct: needs groups >= 1 and steps >= 0; got {groups} and {steps}")
+    settings = settings or InferenceConfig()
+    given = {"groups": groups, "steps": steps, "step_size": step_size}
+    settings = dataclasses.replace(settings, **{k: v for k, v in given.items() if v is not None})
+    _check(settings)
+
     shapes, views = images.shape[:2]
     generator = torch.Generator().manual_seed(seed)
-    candidates = torch.randn(groups, shapes, views, model.code_dim, generator=generator)
-    with torch.no_grad():
-        features = model.encode(images.flatten(0, 1))
+    candidates = torch.randn(settings.groups, shapes, views, model.code_dim, generator=generator)
+    at_once = max(1, _POINTS_AT_ONCE // (views * model.points))
+    parts = [
+        _reconstruct(model, some_images, some_candidates, settings)
+        for some_images, some_candidates in zip(
+            images.split(at_once), candidates.split(at_once, dim=1), strict=True
+        )
+    ]
+    points, codes, histories, kept = zip(*parts, strict=True)
+    rows = max(len(history) for history in histories)
+    history = torch.cat([_prolong(history, rows) for history in histories], dim=1)
+    return Reconstruction(torch.cat(points), torch.cat(codes), history, torch.cat(kept))
 
-    if views == 1 or model.config.deterministic:
-        with torch.no_grad():
+
+def _check(settings: InferenceConfig) -> None:
+    if settings.groups < 1 or settings.steps < 0 or settings.patience < 0:
+        raise ValueError(
+            "reconstruct: needs groups >= 1, steps >= 0 and patience >= 0; "
+            f"got {settings.groups}, {settings.steps} and {settings.patience}"
+        )
+
+
+def _prolong(history: Tensor, rows: int) -> Tensor:
+    """Repeats the last row of a part that stopped before the others."""
+    return torch.cat([history, history[-1:].expand(rows - len(history), -1)]) if len(history) else history
+
+
+def _reconstruct(
+    model: Generator, images: Tensor, candidates: Tensor, settings: InferenceConfig
+) -> Reconstruction:
+    """(B, V, 3, H, W) images and (G, B, V, D) candidates, few enough for memory."""
+    shapes, views = images.shape[:2]
+    with torch.no_grad():
+        features = model.encode(images.flatten(0, 1)).unflatten(0, (shapes, views))
+        if views == 1 or model.config.deterministic:
             clouds = _decode(model, features, candidates[0])
-        return Reconstruction(clouds.flatten(1, 2), candidates[0], torch.zeros(0, shapes))
-
-    codes = _most_consistent(model, features, candidates)
-    codes, history = _descend(model, features, codes, steps=steps, step_size=step_size)
-    with torch.no_grad():
-        clouds = _decode(model, features, codes)
-        final = consistency_loss(clouds, reduction="none")
-    return Reconstruction(clouds.flatten(1, 2), codes, 100 * torch.stack([*history, final]))
+            nothing = torch.zeros(0, shapes)
+            return Reconstruction(
+                clouds.flatten(1, 2), candidates[0], nothing, torch.zeros(shapes, dtype=torch.int64)
+            )
+        codes = candidates[0]
+        if settings.groups > 1:
+            scores = [
+                consistency_loss(_decode(model, features, group), reduction="none") for group in candidates
+            ]
+            codes = candidates[torch.stack(scores).argmin(0), torch.arange(shapes)]
+    return _descend(model, features, codes, settings)
 
 
 def _decode(model: Generator, features: Tensor, codes: Tensor) -> Tensor:
-    """(B*V, ...) features and (B, V, D) codes -> (B, V, N, 3)."""
-    return model.decode(features, codes.flatten(0, 1)[None])[0].unflatten(0, codes.shape[:2])
+    """(B, V, C, h, w) features and (B, V, D) codes -> (B, V, N, 3)."""
+    clouds = model.decode(features.flatten(0, 1), codes.flatten(0, 1)[None])[0]
+    return clouds.unflatten(0, codes.shape[:2])
 
 
-@torch.no_grad()
-def _most_consistent(model: Generator, features: Tensor, candidates: Tensor) -> Tensor:
-    """(G, B, V, D) candidates -> (B, V, D): for each object the group with the lowest consistency loss."""
-    scores = torch.stack(
-        [consistency_loss(_decode(model, features, codes), reduction="none") for codes in candidates]
-    )
-    best = scores.argmin(0)
-    return candidates[best, torch.arange(candidates.shape[1])]
-
-
-def _descend(
-    model: Generator, features: Tensor, codes: Tensor, *, steps: int, step_size: float
-) -> tuple[Tensor, list[Tensor]]:
+def _descend(model: Generator, features: Tensor, codes: Tensor, settings: InferenceConfig) -> Reconstruction:
     """Plain gradient descent on (B, V, D) codes; every object has its own loss, so objects do not interact."""
-    history = []
-    for _ in range(steps):
-        codes = codes.detach().requires_grad_()
-        with torch.enable_grad():
-            loss = consistency_loss(_decode(model, features, codes), reduction="none")
-            (gradient,) = torch.autograd.grad(100 * loss.sum(), codes)
-        history.append(loss.detach())
-        codes = codes - step_size * gradient
-    return codes.detach(), history
+    codes = codes.clone()
+    norms = codes.norm(dim=-1, keepdim=True)
+    shapes, views = codes.shape[:2]
+    found = Reconstruction(
+        points=codes.new_zeros(shapes, views, model.points, 3),
+        codes=codes.clone(),
+        history=codes.new_zeros(settings.steps + 1, shapes),
+        kept=torch.zeros(shapes, dtype=torch.int64),
+    )
+    lowest = codes.new_full((shapes,), torch.inf)
+    waited = torch.zeros(shapes, dtype=torch.int64)
+    active = torch.arange(shapes)  # shapes whose descent still goes on
+    for step in range(settings.steps + 1):
+        last = step == settings.steps
+        moving = codes[active].requires_grad_(not last)
+        with torch.set_grad_enabled(not last):
+            clouds = _decode(model, features[active], moving)
+            loss = 100 * consistency_loss(clouds, reduction="none")
+        found.history[step:, active] = loss.detach()
+
+        fell = loss.detach() < lowest[active] - settings.min_drop
+        lowest[active] = torch.where(fell, loss.detach(), lowest[active])
+        waited[active] = torch.where(fell, 0, waited[active] + 1)
+        keep = fell if settings.keep_best else torch.ones_like(fell)
+        found.points[active[keep]] = clouds.detach()[keep]
+        found.codes[active[keep]] = codes[active[keep]]
+        found.kept[active[keep]] = step
+        if last:
+            break
+
+        (gradient,) = torch.autograd.grad(loss.sum(), moving)
+        moved = moving.detach() - settings.step_size * (gradient + settings.prior * moving.detach())
+        if settings.keep_norm:
+            moved *= norms[active] / moved.norm(dim=-1, keepdim=True)
+        codes[active] = moved
+        if settings.patience:
+            active = active[waited[active] < settings.patience]
+            if len(active) == 0:
+                break
+    return found._replace(points=found.points.flatten(1, 2), history=found.history[: step + 1])
