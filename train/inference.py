@@ -157,10 +157,12 @@ def _descend(model: Generator, features: Tensor, codes: Tensor, settings: Infere
         with torch.set_grad_enabled(not last):
             clouds = _decode(model, features[active], moving)
             loss = 100 * consistency_loss(clouds, reduction="none")
-        found.history[step:, active] = loss.detach()
+            total = loss.sum()
+        loss = loss.detach()
+        found.history[step:, active] = loss
 
-        fell = loss.detach() < lowest[active] - settings.min_drop
-        lowest[active] = torch.where(fell, loss.detach(), lowest[active])
+        fell = loss < lowest[active] - settings.min_drop
+        lowest[active] = torch.where(fell, loss, lowest[active])
         waited[active] = torch.where(fell, 0, waited[active] + 1)
         keep = fell if settings.keep_best else torch.ones_like(fell)
         found.points[active[keep]] = clouds.detach()[keep]
@@ -169,7 +171,7 @@ def _descend(model: Generator, features: Tensor, codes: Tensor, settings: Infere
         if last:
             break
 
-        (gradient,) = torch.autograd.grad(loss.sum(), moving)
+        (gradient,) = torch.autograd.grad(total, moving)
         moved = moving.detach() - settings.step_size * (gradient + settings.prior * moving.detach())
         if settings.keep_norm:
             moved *= norms[active] / moved.norm(dim=-1, keepdim=True)
