@@ -11,7 +11,7 @@ from diffpoint import _bridge
 
 BLOCK = 32  # as in kernels/blocks.py
 GROUP = 32
-_LANES = 16
+LANES = 16
 _MOST_BITS = 6
 
 
@@ -19,13 +19,25 @@ class Blocks(NamedTuple):
     """A batch of clouds sorted along a Morton curve."""
 
     points: Tensor
-    """(B, N', 3) in the curve's order, N' the next multiple of 512; the padding lies far away."""
+    """(B, N', 3) in the curve's order, N' the next multiple of 1024; the padding is infinite."""
     order: Tensor
     """(B, N') int32: where each of them was before; a large number in the padding."""
     boxes: Tensor
     """(B, 6, N' / 32) least and greatest corner of every 32 points."""
     groups: Tensor
-    """(B, 6, ceil(N' / 1024)) the same of every 32 boxes."""
+    """(B, 6, G) the same of every 32 boxes, G the next multiple of 16; those without points are infinite."""
+    size: int
+    """N"""
+
+    @property
+    def box_lanes(self) -> Tensor:
+        """`boxes` in rows of 16, for kernels that load whole vectors."""
+        return self.boxes.view(*self.boxes.shape[:2], -1, LANES)
+
+    @property
+    def group_lanes(self) -> Tensor:
+        """`groups` in rows of 16."""
+        return self.groups.view(*self.groups.shape[:2], -1, LANES)
 
 
 def sort_into_blocks(points: Tensor, lengths: Tensor) -> Blocks:
@@ -35,15 +47,16 @@ def sort_into_blocks(points: Tensor, lengths: Tensor) -> Blocks:
     bits = 2
     while bits < _MOST_BITS and 8 ** (bits + 1) <= 2 * size:
         bits += 1
-    boxes = -(-size // (BLOCK * _LANES)) * _LANES  # whole vectors of boxes
+    boxes = -(-size // (BLOCK * GROUP)) * GROUP  # whole groups
     result = Blocks(
         points.new_empty((batch, boxes * BLOCK, 3)),
         torch.full((batch, boxes * BLOCK), 2**31 - 1, dtype=torch.int32),
         points.new_empty((batch, 6, boxes)),
-        points.new_empty((batch, 6, -(-boxes // GROUP))),
+        points.new_empty((batch, 6, -(-boxes // (GROUP * LANES)) * LANES)),
+        size,
     )
     key = torch.empty((batch, size), dtype=torch.int32)
-    histogram = torch.empty((batch, 8**bits), dtype=torch.int32)
+    histogram = torch.empty((batch, max(8**bits, boxes)), dtype=torch.int32)
     scratch = result.points, result.order, key, histogram, result.boxes, result.groups
     _bridge.launch("blocks", "sort", points.dtype, points, lengths, *scratch, bits)
     return result

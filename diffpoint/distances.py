@@ -8,19 +8,20 @@ import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
-from diffpoint.blocks import sort_into_blocks
+from diffpoint.blocks import Blocks, sort_into_blocks
 
-# Pairs of points from which passing over boxes is faster than trying all pairs.
-_LARGE = 2**26
+# Pairs of points from which passing over boxes is faster than trying all pairs, whatever the clouds.
+_LARGE = 2**23
 
 
 class Nearest(NamedTuple):
     """For each point of the first set, its nearest point of the second."""
 
     squared_distance: Tensor
-    """(*B, N); 0 in the padding of `a`, +inf where `b` is empty."""
+    """(*B, N); 0 in the padding of `a`; +inf where `b` is empty, or too far for the square to be a number (in float32
+    from 1.8e19 on)."""
     index: Tensor
-    """(*B, N) int64 into `b`; -1 in the padding of `a` and where `b` is empty."""
+    """(*B, N) int64 into `b`; -1 in the padding of `a` and where the distance is infinite."""
 
 
 class Chamfer(NamedTuple):
@@ -54,7 +55,7 @@ def nearest(
         [0.25, 2.25]
     """
     a3, b3, la, lb, _ = paired_sets("nearest", a, b, a_lengths, b_lengths)
-    squared_distance, index = _nearest(a3, b3, la, lb, "nearest", 0)
+    squared_distance, index = _nearest(a3, b3, la, lb)
     return Nearest(squared_distance.reshape(a.shape[:-1]), index.reshape(a.shape[:-1]))
 
 
@@ -83,8 +84,9 @@ def chamfer_distance(
         [1.0, 3.0]
     """
     a3, b3, la, lb, batch = paired_sets("chamfer_distance", a, b, a_lengths, b_lengths)
-    a_to_b = _mean_distance(_nearest(a3, b3, la, lb, "chamfer_distance", 1)[0], la, squared)
-    b_to_a = _mean_distance(_nearest(b3, a3, lb, la, "chamfer_distance", 1)[0], lb, squared)
+    from_a, _, from_b, _ = _nearest_both(a3, b3, la, lb)
+    a_to_b = _mean_distance(from_a, la, squared)
+    b_to_a = _mean_distance(from_b, lb, squared)
     return Chamfer(a_to_b.reshape(batch), b_to_a.reshape(batch))
 
 
@@ -121,7 +123,7 @@ def paired_sets(
     return a3, b3, la, lb, batch
 
 
-def _nearest_fake(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, caller: str, smallest: int):
+def _nearest_fake(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor):
     return a.new_empty(a.shape[:2]), a.new_empty(a.shape[:2], dtype=torch.int64)
 
 
@@ -133,27 +135,17 @@ def _nearest_setup(ctx, inputs, output) -> None:
 
 def _nearest_gradient(ctx, grad_squared_distance: Tensor, _grad_index):
     a, b, index = ctx.saved_tensors
-    return *_nearest_backward(a, b, index, grad_squared_distance), None, None, None, None
+    return *_nearest_backward(a, b, index, grad_squared_distance), None, None
 
 
 @_bridge.register("nearest", fake=_nearest_fake, backward=_nearest_gradient, setup=_nearest_setup)
-def _nearest(
-    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, caller: str, smallest: int
-) -> tuple[Tensor, Tensor]:
-    _checks.check_sets(caller, a, b, a_lengths, b_lengths, smallest=smallest)
-    squared_distance = a.new_empty(a.shape[:2])
-    index = a.new_empty(a.shape[:2], dtype=torch.int64)
-    if b.shape[1] == 0:
-        padding = torch.arange(a.shape[1]) >= a_lengths[:, None]
-        squared_distance.fill_(torch.inf).masked_fill_(padding, 0)
-        index.fill_(-1)
-    elif a.numel() and a.shape[1] * b.shape[1] < _LARGE:
-        _bridge.launch("nearest", "forward", a.dtype, a, b, a_lengths, b_lengths, squared_distance, index)
-    elif a.numel():
-        x, y = sort_into_blocks(a, a_lengths), sort_into_blocks(b, b_lengths)
-        sets = x.points, x.order, y.points, y.order, y.boxes, y.groups, a_lengths, b_lengths
-        _bridge.launch("nearest", "forward_blocks", a.dtype, *sets, squared_distance, index)
-    return squared_distance, index
+def _nearest(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor) -> tuple[Tensor, Tensor]:
+    _checks.check_sets("nearest", a, b, a_lengths, b_lengths, smallest=0)
+    if _is_large(a, b):
+        return _search_blocks(
+            sort_into_blocks(a, a_lengths), sort_into_blocks(b, b_lengths), a_lengths, b_lengths
+        )
+    return _search(a, b, a_lengths, b_lengths)
 
 
 @_bridge.register(
@@ -164,6 +156,78 @@ def _nearest_backward(
     a: Tensor, b: Tensor, index: Tensor, grad_squared_distance: Tensor
 ) -> tuple[Tensor, Tensor]:
     grad_a, grad_b = a.new_zeros(a.shape), b.new_zeros(b.shape)
+    _add_gradients(a, b, index, grad_squared_distance, grad_a, grad_b)
+    return grad_a, grad_b
+
+
+def _both_fake(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor):
+    return *_nearest_fake(a, b, a_lengths, b_lengths), *_nearest_fake(b, a, b_lengths, a_lengths)
+
+
+def _both_setup(ctx, inputs, output) -> None:
+    a, b, *_ = inputs
+    _, from_a, _, from_b = output
+    ctx.mark_non_differentiable(from_a, from_b)
+    ctx.save_for_backward(a, b, from_a, from_b)
+
+
+def _both_gradient(ctx, grad_from_a: Tensor, _index_a, grad_from_b: Tensor, _index_b):
+    a, b, from_a, from_b = ctx.saved_tensors
+    return *_nearest_both_backward(a, b, from_a, from_b, grad_from_a, grad_from_b), None, None
+
+
+@_bridge.register("nearest_both", fake=_both_fake, backward=_both_gradient, setup=_both_setup)
+def _nearest_both(
+    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """`_nearest` from `a` to `b` and from `b` to `a`, with one check and one sorting of each."""
+    _checks.check_sets("chamfer_distance", a, b, a_lengths, b_lengths, smallest=1)
+    if _is_large(a, b):
+        x, y = sort_into_blocks(a, a_lengths), sort_into_blocks(b, b_lengths)
+        return *_search_blocks(x, y, a_lengths, b_lengths), *_search_blocks(y, x, b_lengths, a_lengths)
+    return *_search(a, b, a_lengths, b_lengths), *_search(b, a, b_lengths, a_lengths)
+
+
+@_bridge.register(
+    "nearest_both_backward",
+    fake=lambda a, b, from_a, from_b, grad_from_a, grad_from_b: (a.new_empty(a.shape), b.new_empty(b.shape)),
+)
+def _nearest_both_backward(
+    a: Tensor, b: Tensor, from_a: Tensor, from_b: Tensor, grad_from_a: Tensor, grad_from_b: Tensor
+) -> tuple[Tensor, Tensor]:
+    grad_a, grad_b = a.new_zeros(a.shape), b.new_zeros(b.shape)
+    _add_gradients(a, b, from_a, grad_from_a, grad_a, grad_b)
+    _add_gradients(b, a, from_b, grad_from_b, grad_b, grad_a)
+    return grad_a, grad_b
+
+
+def _is_large(a: Tensor, b: Tensor) -> bool:
+    return a.shape[0] > 0 and a.shape[1] > 0 and b.shape[1] > 0 and a.shape[1] * b.shape[1] >= _LARGE
+
+
+def _search(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor) -> tuple[Tensor, Tensor]:
+    squared_distance = a.new_empty(a.shape[:2])
+    index = a.new_empty(a.shape[:2], dtype=torch.int64)
+    if b.shape[1] == 0:
+        padding = torch.arange(a.shape[1]) >= a_lengths[:, None]
+        squared_distance.fill_(torch.inf).masked_fill_(padding, 0)
+        index.fill_(-1)
+    elif a.numel():
+        _bridge.launch("nearest", "forward", a.dtype, a, b, a_lengths, b_lengths, squared_distance, index)
+    return squared_distance, index
+
+
+def _search_blocks(a: Blocks, b: Blocks, a_lengths: Tensor, b_lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """As `_search`, of clouds that have been sorted."""
+    squared_distance = a.points.new_empty((len(a_lengths), a.size))
+    index = torch.empty(squared_distance.shape, dtype=torch.int64)
+    sets = a.points, a.order, b.points, b.order, b.boxes, b.box_lanes, b.group_lanes, a_lengths, b_lengths
+    _bridge.launch("nearest", "forward_blocks", a.points.dtype, *sets, squared_distance, index)
+    return squared_distance, index
+
+
+def _add_gradients(
+    a: Tensor, b: Tensor, index: Tensor, grad_squared_distance: Tensor, grad_a: Tensor, grad_b: Tensor
+) -> None:
     if a.numel() and b.numel():
         _bridge.launch("nearest", "backward", a.dtype, a, b, index, grad_squared_distance, grad_a, grad_b)
-    return grad_a, grad_b

@@ -78,7 +78,7 @@ def _farthest(points: Tensor, lengths: Tensor, k: int, start: int) -> Tensor:
     box_point = torch.zeros(box_farthest.shape, dtype=torch.int32)
     scratch = distance, box_farthest, box_farthest.view(batch, -1, _LANES), box_point
     axes = lanes(blocks.points)
-    sorted_points = blocks.points, *axes, blocks.order, blocks.boxes.view(batch, 6, -1, _LANES)
+    sorted_points = blocks.points, *axes, blocks.order, blocks.box_lanes
     _bridge.launch("sampling", "farthest_blocks", points.dtype, *sorted_points, *scratch, chosen, start)
     return chosen
 

@@ -53,7 +53,7 @@ def test_nearest_takes_uneven_and_empty_sets(dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (33, 70), (500, 3000), (3000, 500)])
-@pytest.mark.parametrize("kind", ["random", "lattice", "one place", "line", "extreme"])
+@pytest.mark.parametrize("kind", ["random", "lattice", "one place", "line", "extreme", "beyond the format"])
 def test_large_and_small_sets_are_searched_with_the_same_result(monkeypatch, dtype, n, m, kind):
     """The search that passes over boxes gives the bits of the one that tries every pair, ties included."""
     a, b = random(3, n, 3, seed=1, dtype=dtype), random(3, m, 3, seed=2, dtype=dtype)
@@ -65,12 +65,46 @@ def test_large_and_small_sets_are_searched_with_the_same_result(monkeypatch, dty
         a[..., 1:] = b[..., 1:] = 0
     elif kind == "extreme":
         a, b = a * 1e6, b * 1e-6
+    elif kind == "beyond the format":  # some of the squares are infinite
+        a, b = (x.double() * (1e20 if dtype == torch.float32 else 1e155) for x in (a, b))
+        a, b = a.to(dtype), b.to(dtype)
     lengths = {"a_lengths": torch.tensor([n, n // 2, n]), "b_lengths": torch.tensor([m, m, m // 3])}
     every_pair = dp.nearest(a, b, **lengths)
     monkeypatch.setattr(distances, "_LARGE", 0)
     with_boxes = dp.nearest(a, b, **lengths)
     assert torch.equal(every_pair.index, with_boxes.index)
     assert torch.equal(every_pair.squared_distance, with_boxes.squared_distance)
+    assert (with_boxes.index < torch.maximum(lengths["b_lengths"], torch.tensor(1))[:, None]).all()
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_distances_beyond_the_number_format_are_infinite(monkeypatch, large):
+    if large:
+        monkeypatch.setattr(distances, "_LARGE", 0)
+    a = torch.tensor([[0.0, 0, 0], [2e19, 0, 0]], requires_grad=True)
+    b = torch.tensor([[-1e19, 0, 0], [1e19, 1, 0]], requires_grad=True)
+    result = dp.nearest(a[1:] * 2, b)
+    assert result.squared_distance.tolist() == [torch.inf]
+    assert result.index.tolist() == [-1]
+    result = dp.nearest(a, b)
+    assert torch.equal(result.index, torch.tensor([0, 1]))
+    assert torch.isfinite(result.squared_distance).all()
+    far = dp.chamfer_distance(a * 2, b, squared=False)
+    assert far.a_to_b.item() == torch.inf
+    gradients = torch.autograd.grad(far.a_to_b, (a, b))
+    assert all(torch.isfinite(g).all() for g in gradients)
+
+
+def test_chamfer_of_large_clouds_is_that_of_small_ones(monkeypatch):
+    a, b = leaf(2, 700, 3, seed=1), leaf(2, 1100, 3, seed=2)
+    lengths = {"a_lengths": torch.tensor([700, 40]), "b_lengths": torch.tensor([1100, 1000])}
+    results = []
+    for threshold in (2**40, 0):
+        monkeypatch.setattr(distances, "_LARGE", threshold)
+        chamfer = dp.chamfer_distance(a, b, squared=False, **lengths)
+        gradients = torch.autograd.grad(chamfer.a_to_b.sum() + 2 * chamfer.b_to_a.sum(), (a, b))
+        results.append((*chamfer, *gradients))
+    assert all(torch.equal(x, y) for x, y in zip(*results, strict=True))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -20,7 +20,8 @@ def operator_arguments() -> dict[str, tuple]:
     projection = camera.projection.clone().requires_grad_()
     depth = dp.splat_depth(a.detach(), camera).depth.requires_grad_()
     return {
-        "nearest": (a, b, *lengths, "nearest", 0),
+        "nearest": (a, b, *lengths),
+        "nearest_both": (a, b, *lengths),
         "splat": (a, lengths[0], projection, H, W, 0.0),
         "project": (a, projection, "project"),
         "unproject": (depth, camera.back_projection.clone().requires_grad_(), True, "unproject"),
@@ -41,6 +42,7 @@ def test_operators_pass_opcheck(name):
     "function",
     [
         lambda a, b: dp.nearest(a, b).squared_distance.sum(),
+        lambda a, b: sum(dp.chamfer_distance(a, b, squared=True)).sum(),
         lambda a, b: dp.earth_mover_distance(a, b).cost.sum(),
     ],
 )

@@ -6,6 +6,7 @@ from diffpoint.kernels._backend import ti
 
 BLOCK = 32  # points in a box
 GROUP = 32  # boxes in a box of boxes
+LANES = 16  # boxes in a vector
 
 
 def build(real):
@@ -13,9 +14,7 @@ def build(real):
     boxes3 = ti.types.ndarray(dtype=real, ndim=3)
     counts1 = ti.types.ndarray(dtype=ti.i64, ndim=1)
     indices2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
-    outside = (
-        1.0e15 if real == ti.f32 else 1.0e150
-    )  # corners of boxes without points: far, and squares stay finite
+    outside = ti.math.inf  # the padding: never nearest, never within reach
 
     @ti.func
     def spread_bits(x: ti.i32):
@@ -39,10 +38,10 @@ def build(real):
         bits: ti.i32,
         spread: ti.i32,
     ):
-        """Counting sort by Morton key with `bits` bits for each axis (stable), then the boxes of every 32 points.
+        """Counting sort by Morton key with `bits` bits for each axis, then the boxes of every 32 points.
 
-        ordered has whole boxes, filled up with points far away. order: where each sorted point came from.
-        boxes and groups: (B, 6, count) least and greatest corners.
+        Within a box the points keep their order. ordered has whole boxes, filled up with infinity. order: where each
+        sorted point came from. boxes and groups: (B, 6, count) least and greatest corners.
         """
         for step in range(points.shape[0] * spread):
             if step % spread == 0:
@@ -75,6 +74,13 @@ def build(real):
                 for i in range(n):
                     place = histogram[cloud, key[cloud, i]]
                     histogram[cloud, key[cloud, i]] = place + 1
+                    key[cloud, i] = place // BLOCK
+                for box in range(boxes.shape[2]):
+                    histogram[cloud, box] = 0
+                for i in range(n):
+                    box = key[cloud, i]
+                    place = box * BLOCK + histogram[cloud, box]
+                    histogram[cloud, box] += 1
                     order[cloud, place] = i
                     for k in ti.static(range(3)):
                         ordered[cloud, place, k] = points[cloud, i, k]

@@ -7,62 +7,69 @@ than what each of its queries has found. Both give the same distances and the sa
 from types import SimpleNamespace
 
 from diffpoint.kernels._backend import ti
-from diffpoint.kernels.blocks import BLOCK, GROUP
+from diffpoint.kernels.blocks import BLOCK, GROUP, LANES
 
 CHUNK = 32  # candidates between two updates of the winning chunk
+ROWS = GROUP // LANES  # rows of boxes in a group
 
 
 def build(real):
     tile = 32 if real == ti.f32 else 16  # queries held in vector registers
-    largest = 3.0e38 if real == ti.f32 else 1.0e300
     clouds = ti.types.ndarray(dtype=real, ndim=3)
     scalars = ti.types.ndarray(dtype=real, ndim=2)
     integers = ti.types.ndarray(dtype=ti.i64, ndim=1)
     indices = ti.types.ndarray(dtype=ti.i64, ndim=2)
     orders = ti.types.ndarray(dtype=ti.i32, ndim=2)
-    boxes3 = ti.types.ndarray(dtype=real, ndim=3)
+    lanes3 = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=3)
 
     @ti.func
-    def apart(boxes: ti.template(), cloud, box, low: ti.template(), high: ti.template()):
-        """Squared distance between a box and the box from `low` to `high`; 0 where they meet."""
-        total = real(0.0)
+    def span(x: ti.template(), least, greatest):
+        """Squared distance from each coordinate in `x` to the span from least to greatest; 0 within."""
+        squares = least - x
+        for s in ti.static(range(tile)):
+            below = least - x[s]
+            above = x[s] - greatest
+            outside = ti.select(below > above, below, above)
+            outside = ti.select(outside > 0, outside, real(0.0))
+            squares[s] = outside * outside
+        return squares
+
+    @ti.func
+    def reached(boxes: ti.template(), cloud, row, low: ti.template(), high: ti.template(), farthest):
+        """Bit s: box s of a row of 16 is within the squared distance `farthest` of the box from `low` to `high`."""
+        total = ti.Vector([real(0.0) for s in ti.static(range(LANES))])
         for k in ti.static(range(3)):
-            gap = ti.max(ti.max(boxes[cloud, k, box] - high[k], low[k] - boxes[cloud, k + 3, box]), real(0.0))
-            total += gap * gap
-        return total
+            below = boxes[cloud, k, row] - high[k]
+            above = low[k] - boxes[cloud, k + 3, row]
+            for s in ti.static(range(LANES)):
+                outside = ti.select(below[s] > above[s], below[s], above[s])
+                outside = ti.select(outside > 0, outside, real(0.0))
+                total[s] += outside * outside
+        bits = 0
+        for s in ti.static(range(LANES)):
+            bits |= ti.select(total[s] <= farthest, 1 << s, 0)
+        return bits
 
     @ti.func
-    def nearest_of(boxes: ti.template(), cloud, start, end, low: ti.template(), high: ti.template()):
-        """The box whose centre is nearest to the centre of the box from `low` to `high`."""
-        best = start
-        least = real(largest)
-        for box in range(start, end):
-            d = real(0.0)
+    def most_central(boxes: ti.template(), cloud, start, end, low: ti.template(), high: ti.template()):
+        """Of the boxes in vectors `start` to `end`, the one whose centre is nearest to that of `low` to `high`."""
+        least = ti.Vector([real(ti.math.inf) for s in ti.static(range(LANES))])
+        where = ti.Vector([start for s in ti.static(range(LANES))])
+        for t in range(start, end):
+            d = ti.Vector([real(0.0) for s in ti.static(range(LANES))])
             for k in ti.static(range(3)):
-                offset = boxes[cloud, k, box] + boxes[cloud, k + 3, box] - low[k] - high[k]
+                offset = boxes[cloud, k, t] + boxes[cloud, k + 3, t] - (low[k] + high[k])
                 d += offset * offset
-            best = ti.select(d < least, box, best)
-            least = ti.select(d < least, d, least)
+            for s in ti.static(range(LANES)):
+                closer = d[s] < least[s]
+                where[s] = ti.select(closer, t, where[s])
+                least[s] = ti.select(closer, d[s], least[s])
+        best = where[0] * LANES
+        for s in ti.static(range(1, LANES)):
+            closer = least[s] < least[0]
+            best = ti.select(closer, where[s] * LANES + s, best)
+            least[0] = ti.select(closer, least[s], least[0])
         return best
-
-    @ti.func
-    def outwards(start, turn):
-        """start, start + 1, start - 1, start + 2, ..."""
-        return start + ti.select(turn % 2 == 1, (turn + 1) // 2, -(turn // 2))
-
-    @ti.func
-    def scan_box(b: ti.template(), b_order: ti.template(), cloud, box, m, here: ti.template(), best, best_j):
-        """The nearer of what was found before and the points of a box; of equals the one that came first unsorted."""
-        for j in range(box * BLOCK, ti.min(box * BLOCK + BLOCK, m)):
-            dx = b[cloud, j, 0] - here[0]
-            dy = b[cloud, j, 1] - here[1]
-            dz = b[cloud, j, 2] - here[2]
-            d = dx * dx + dy * dy + dz * dz
-            source = b_order[cloud, j]
-            closer = (d < best) | ((d == best) & (source < best_j))
-            best_j = ti.select(closer, source, best_j)
-            best = ti.select(closer, d, best)
-        return best, best_j
 
     @ti.kernel
     def forward(
@@ -86,7 +93,7 @@ def build(real):
                     ax = ti.Vector([a[cloud, ti.min(first + s, n - 1), 0] for s in ti.static(range(tile))])
                     ay = ti.Vector([a[cloud, ti.min(first + s, n - 1), 1] for s in ti.static(range(tile))])
                     az = ti.Vector([a[cloud, ti.min(first + s, n - 1), 2] for s in ti.static(range(tile))])
-                    least = ti.Vector([real(largest) for s in ti.static(range(tile))])
+                    least = ti.Vector([real(ti.math.inf) for s in ti.static(range(tile))])
                     winner = ti.Vector([0 for s in ti.static(range(tile))])
                     for chunk in range((m + CHUNK - 1) // CHUNK):
                         # Only the minimum is tracked among the candidates of a chunk; which of them it was is
@@ -111,8 +118,8 @@ def build(real):
                             chunk = 0
                             for r in ti.static(range(tile)):
                                 chunk = ti.select(r == s, winner[r], chunk)
-                            best = real(largest)
-                            best_j = chunk * CHUNK
+                            best = real(ti.math.inf)
+                            best_j = -1  # stays where every squared distance is beyond the number format
                             for j in range(chunk * CHUNK, ti.min(chunk * CHUNK + CHUNK, m)):
                                 dx = b[cloud, j, 0] - a[cloud, i, 0]
                                 dy = b[cloud, j, 1] - a[cloud, i, 1]
@@ -135,17 +142,20 @@ def build(real):
         a_order: orders,
         b: clouds,
         b_order: orders,
-        b_boxes: boxes3,
-        b_groups: boxes3,
+        corners: clouds,
+        box_lanes: lanes3,
+        group_lanes: lanes3,
         a_lengths: integers,
         b_lengths: integers,
         squared_distance: scalars,
         index: indices,
         spread: ti.i32,
     ):
-        """`a` and `b` as sorted by `blocks.sort`; results go to the points' places before sorting."""
+        """`a` and `b` as sorted by `blocks.sort`; results go to the points' places before sorting.
+
+        `corners` and `box_lanes` are the same memory: the boxes of `b`.
+        """
         tiles = (squared_distance.shape[1] + tile - 1) // tile
-        groups = b_groups.shape[2]
         for step in range(a.shape[0] * tiles * spread):
             if step % spread == 0:
                 work = step // spread
@@ -154,81 +164,74 @@ def build(real):
                 n = ti.cast(a_lengths[cloud], ti.i32)
                 m = ti.cast(b_lengths[cloud], ti.i32)
                 if first < n and m > 0:
-                    boxes = (m + BLOCK - 1) // BLOCK
                     ax = ti.Vector([a[cloud, ti.min(first + s, n - 1), 0] for s in ti.static(range(tile))])
                     ay = ti.Vector([a[cloud, ti.min(first + s, n - 1), 1] for s in ti.static(range(tile))])
                     az = ti.Vector([a[cloud, ti.min(first + s, n - 1), 2] for s in ti.static(range(tile))])
                     low = ti.Vector([ax.min(), ay.min(), az.min()])
                     high = ti.Vector([ax.max(), ay.max(), az.max()])
-                    least = ti.Vector([real(largest) for s in ti.static(range(tile))])
-                    winner = ti.Vector([0 for s in ti.static(range(tile))])
-                    tied = ti.Vector([0 for s in ti.static(range(tile))])
-                    farthest = real(largest)  # of the nearest found so far, over the tile
-                    start_group = nearest_of(b_groups, cloud, 0, groups, low, high)
-                    start = nearest_of(
-                        b_boxes,
-                        cloud,
-                        start_group * GROUP,
-                        ti.min(start_group * GROUP + GROUP, boxes),
-                        low,
-                        high,
-                    )
-                    # Outwards from the nearest box of the nearest group: neighbours on the curve are neighbours in
-                    # space, and what is found first lets most of the rest be passed over.
-                    for group_turn in range(2 * groups):
-                        group = outwards(start_group, group_turn)
-                        reachable = group >= 0 and group < groups
-                        if reachable:
-                            reachable = apart(b_groups, cloud, group, low, high) <= farthest
-                        if reachable:
-                            first_box = group * GROUP
-                            last_box = ti.min(first_box + GROUP, boxes) - 1
-                            for turn in range(2 * GROUP):
-                                box = outwards(ti.max(ti.min(start, last_box), first_box), turn)
-                                worthwhile = box >= first_box and box <= last_box
-                                if worthwhile:
-                                    worthwhile = apart(b_boxes, cloud, box, low, high) <= farthest
-                                if worthwhile:
-                                    current = ti.Vector([real(largest) for s in ti.static(range(tile))])
+                    least = ti.Vector([real(ti.math.inf) for s in ti.static(range(tile))])
+                    winner = ti.Vector([-1 for s in ti.static(range(tile))])
+                    farthest = real(ti.math.inf)  # of the nearest found so far, over the tile
+                    # First the box in the middle of the tile, then the rest of its group, then the other groups:
+                    # what is found first lets most of the rest be passed over.
+                    own_group = most_central(group_lanes, cloud, 0, group_lanes.shape[2], low, high)
+                    own_row = own_group * ROWS
+                    own_box = most_central(box_lanes, cloud, own_row, own_row + ROWS, low, high)
+                    for turn in range(group_lanes.shape[2] + 2):
+                        group_row = ti.select(turn < 2, own_group // LANES, turn - 2)
+                        groups = 1 << (own_group % LANES)
+                        if turn >= 2:
+                            same = ti.select(group_row == own_group // LANES, groups, 0)
+                            groups = reached(group_lanes, cloud, group_row, low, high, farthest) & ~same
+                        for group_step in range(ti.select(groups != 0, LANES * ROWS, 0)):
+                            row = group_row * LANES * ROWS + group_step
+                            boxes = 0
+                            # Where squares overflow even the padding of the groups is within reach.
+                            if (groups >> (group_step // ROWS)) & 1 != 0 and row < box_lanes.shape[2]:
+                                own = ti.select(row == own_box // LANES, 1 << (own_box % LANES), 0)
+                                if turn == 0:
+                                    boxes = own
+                                else:
+                                    boxes = reached(box_lanes, cloud, row, low, high, farthest) & ~own
+                            for lane in range(ti.select(boxes != 0, LANES, 0)):
+                                box = row * LANES + lane
+                                within = (boxes >> lane) & 1
+                                if within != 0:
+                                    d = span(ax, corners[cloud, 0, box], corners[cloud, 3, box])
+                                    d += span(ay, corners[cloud, 1, box], corners[cloud, 4, box])
+                                    d += span(az, corners[cloud, 2, box], corners[cloud, 5, box])
+                                    within = 0
+                                    for s in ti.static(range(tile)):
+                                        within |= ti.select(d[s] <= least[s], 1, 0)
+                                if within != 0:
+                                    current = ti.Vector([real(ti.math.inf) for s in ti.static(range(tile))])
+                                    source = ti.Vector([-1 for s in ti.static(range(tile))])
                                     for candidate in range(BLOCK):
                                         j = box * BLOCK + candidate
                                         x = b[cloud, j, 0]
                                         y = b[cloud, j, 1]
                                         z = b[cloud, j, 2]
+                                        before_sorting = b_order[cloud, j]
                                         for s in ti.static(range(tile)):
                                             dx = x - ax[s]
                                             dy = y - ay[s]
                                             dz = z - az[s]
-                                            d = dx * dx + dy * dy + dz * dz
-                                            current[s] = ti.select(d < current[s], d, current[s])
+                                            e = dx * dx + dy * dy + dz * dz
+                                            nearer = e < current[s]
+                                            source[s] = ti.select(nearer, before_sorting, source[s])
+                                            current[s] = ti.select(nearer, e, current[s])
                                     for s in ti.static(range(tile)):
-                                        equal = current[s] == least[s]
-                                        closer = current[s] < least[s]
-                                        tied[s] = ti.select(equal, 1, ti.select(closer, 0, tied[s]))
-                                        winner[s] = ti.select(closer, box, winner[s])
-                                        least[s] = ti.select(closer, current[s], least[s])
+                                        # Of equally near ones the one that came first before sorting.
+                                        earlier = (current[s] == least[s]) & (source[s] < winner[s])
+                                        nearer = (current[s] < least[s]) | earlier
+                                        winner[s] = ti.select(nearer, source[s], winner[s])
+                                        least[s] = ti.select(nearer, current[s], least[s])
                                     farthest = least.max()
-                    for s in range(tile):
+                    for s in ti.static(range(tile)):
                         if first + s < n:
-                            box = 0
-                            ties = 0
-                            for r in ti.static(range(tile)):
-                                box = ti.select(r == s, winner[r], box)
-                                ties = ti.select(r == s, tied[r], ties)
-                            here = ti.Vector([a[cloud, first + s, k] for k in ti.static(range(3))])
-                            best, best_j = scan_box(
-                                b, b_order, cloud, box, m, here, real(largest), b_order[cloud, box * BLOCK]
-                            )
-                            if ties != 0:
-                                # Equally near in several boxes: the lowest index of them all, as without boxes.
-                                for other in range(boxes):
-                                    if apart(b_boxes, cloud, other, here, here) <= best:
-                                        best, best_j = scan_box(
-                                            b, b_order, cloud, other, m, here, best, best_j
-                                        )
                             place = a_order[cloud, first + s]
-                            squared_distance[cloud, place] = best
-                            index[cloud, place] = best_j
+                            squared_distance[cloud, place] = least[s]
+                            index[cloud, place] = winner[s]
                 for s in range(tile):
                     i = first + s
                     if i < squared_distance.shape[1] and (i >= n or m == 0):
@@ -245,7 +248,7 @@ def build(real):
         grad_b: clouds,
         spread: ti.i32,
     ):
-        # One thread owns one cloud: it scatters without atomics, in a fixed order. Gradients come in as zeros.
+        # One thread owns one cloud: it scatters without atomics, in a fixed order, to what the gradients hold.
         for step in range(a.shape[0] * spread):
             if step % spread == 0:
                 cloud = step // spread
@@ -255,7 +258,7 @@ def build(real):
                         g = real(2.0) * grad_squared_distance[cloud, i]
                         for k in ti.static(range(3)):
                             component = g * (a[cloud, i, k] - b[cloud, j, k])
-                            grad_a[cloud, i, k] = component
+                            grad_a[cloud, i, k] += component
                             grad_b[cloud, j, k] -= component
 
     return SimpleNamespace(forward=forward, forward_blocks=forward_blocks, backward=backward)
