@@ -9,9 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from models import build_generator
 from train.batches import load_split
+from train.checkpoint import save_weights
+from train.errors import UserError
 from train.evaluate import evaluate
-from train.metrics import cloud_errors, thin_out
+from train.figures import errors_figure
+from train.metrics import cloud_errors, thin_out, transport_error
+from train.scoring import FIGURES
 from train.table import format_table
 from train.trivial import medoid, nearest_by_image
 
@@ -33,6 +38,31 @@ def test_missing_parts_cost_in_one_direction_only() -> None:
     errors = cloud_errors(lattice[None, :25], lattice[None])
     assert errors.pred_to_gt.item() == 0
     assert errors.gt_to_pred.item() == pytest.approx(100 * (1 + 2 + 3 + 4) / 5, rel=1e-4)
+
+
+def test_the_fscore_counts_points_within_a_hundredth() -> None:
+    truth = _lattice()[None]
+    near, far = truth + torch.tensor([0.009, 0.0, 0.0]), truth + torch.tensor([0.011, 0.0, 0.0])
+    assert cloud_errors(near, truth).fscore.item() == 1
+    assert cloud_errors(far, truth).fscore.item() == 0
+    # Half of the truth is predicted, and as many points elsewhere: precision 1/2, recall 1/2.
+    half = torch.cat([truth[:, :62], truth[:, :62] + 100], dim=1)
+    precision, recall = 0.5, 62 / 125
+    expected = 2 * precision * recall / (precision + recall)
+    assert cloud_errors(half, truth).fscore.item() == pytest.approx(expected)
+
+
+def test_the_transport_error_of_a_shift_is_the_shift_and_sees_crowding() -> None:
+    torch.manual_seed(0)
+    cloud = torch.rand(1, 64, 3)
+    shifted = cloud + torch.tensor([0.0, 0.03, 0.04])
+    assert transport_error(shifted, cloud, points=64).item() == pytest.approx(5.0, rel=0.021)
+    assert transport_error(cloud, cloud, points=16).item() == 0
+    # Every point of the first cloud is a point of the truth, but crowded on one half of it.
+    truth = _lattice()[None]
+    crowded = truth[:, :50].repeat(1, 3, 1)[:, :125]
+    assert cloud_errors(crowded, truth).pred_to_gt.item() == 0
+    assert transport_error(crowded, truth, points=125).item() > 50
 
 
 def test_thinning_keeps_a_spread_out_subset_and_small_clouds_whole() -> None:
@@ -79,8 +109,13 @@ def test_evaluation_holds_what_the_design_promises(smoke_run: Path, tiny_data: P
     assert result["seeds"] == [0, 1]
     assert list(result["views"]) == ["1", "2", "4"]  # the data have four views
     for n, row in result["views"].items():
-        assert set(row) == {"gt_to_pred", "pred_to_gt", "cd", "fps_cd", "consistency"}
+        assert list(row) == list(FIGURES)
+        assert {"gt_to_pred", "pred_to_gt", "cd", "fps_cd", "consistency"} <= row.keys()
         assert row["cd"] == pytest.approx(row["gt_to_pred"] + row["pred_to_gt"], rel=1e-5)
+        assert row["fps_cd"] == pytest.approx(row["fps_gt_to_pred"] + row["fps_pred_to_gt"], rel=1e-5)
+        assert row["emd"] > max(row["fps_pred_to_gt"] / 2, 0)
+        assert 0 <= row["fscore_01"] < 0.5
+        assert 0 < result["spread"][n]["cd"] < 1
         assert (row["consistency"] is None) == (n == "1")
         if n != "1":
             assert row["consistency"] < result["random_codes"][n]["consistency"]
@@ -92,9 +127,53 @@ def test_evaluation_holds_what_the_design_promises(smoke_run: Path, tiny_data: P
     assert sum(shapes.values()) == result["data"]["shapes"] == 3
     weighted = sum(entry["shapes"] * entry["views"]["4"]["cd"] for entry in result["categories"].values()) / 3
     assert weighted == pytest.approx(result["views"]["4"]["cd"], rel=1e-5)
+    by_class = [entry["views"]["4"]["cd"] for entry in result["categories"].values()]
+    assert result["class_average"]["4"]["cd"] == pytest.approx(sum(by_class) / len(by_class))
+    for n in ("2", "4"):
+        agreed = result["agreement"][n]
+        assert agreed["random"] > agreed["searched"] > agreed["descended"]
+        assert agreed["lowered_share"] == 1
+        assert agreed["descended"] == pytest.approx(result["views"][n]["consistency"], rel=1e-5)
+    assert result["diversity"]["codes"] == 10
+    assert result["diversity"]["mean"] > 0.5
     table = format_table(result)
     assert f"{result['views']['4']['cd']:.2f}" in table
+    assert f"{result['spread']['4']['cd']:.3f}" in table
     assert "medoid" in table
+    assert "mean over categories" in table
+
+
+def test_a_network_without_codes_is_scored_by_what_applies(
+    tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torch.manual_seed(0)
+    weights = tmp_path / "plain.safetensors"
+    save_weights(build_generator("smoke", deterministic=True), weights)
+    result = evaluate(weights, tiny_data, seeds=(0, 1), views=(4, 1, 4), limit=2)
+    assert list(result["views"]) == ["1", "4"]
+    assert result["random_codes"] == result["agreement"] == {}
+    assert result["diversity"] is None
+    assert result["sensitivity"]["code"] == 0
+    assert result["views"]["4"]["consistency"] >= 0, "its views can still disagree"
+    assert (tmp_path / "evaluation.json").exists()
+    assert "no codes" in capsys.readouterr().out
+    assert len(errors_figure(result).axes[0].lines) == 3
+
+
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        ({"seeds": ()}, "--seeds needs at least one"),
+        ({"views": (0, 2)}, "none below 1"),
+        ({"limit": 0}, "--limit must be at least 1"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(
+    wrong: dict, complaint: str, smoke_run: Path, tiny_data: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match=complaint):
+        evaluate(smoke_run, tiny_data, out=tmp_path / "never.json", progress=False, **wrong)
+    assert not list(tmp_path.iterdir())
 
 
 def test_evaluation_is_repeatable(smoke_run: Path, tiny_data: Path, tmp_path: Path) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
 from diffpoint import consistency_loss
 from models import Generator, build_generator
+from train.config import InferenceConfig
 from train.inference import reconstruct
 
 
@@ -90,8 +93,100 @@ def test_a_deterministic_network_has_nothing_to_choose(images: torch.Tensor) -> 
     assert found.points.shape == (2, 3 * plain.points, 3)
 
 
+def test_the_history_is_that_of_plain_descent(model: Generator, images: torch.Tensor) -> None:
+    """The rows of `history` against a loop written out here."""
+    found = reconstruct(model, images, groups=1, steps=3, step_size=2.0)
+    codes = reconstruct(model, images, groups=1, steps=0).codes
+    losses = []
+    for _ in range(4):
+        codes = codes.detach().requires_grad_()
+        clouds = model(images.flatten(0, 1), codes.flatten(0, 1)[None])[0].unflatten(0, (2, 3))
+        loss = 100 * consistency_loss(clouds, reduction="none")
+        losses.append(loss.detach())
+        codes = codes - 2.0 * torch.autograd.grad(loss.sum(), codes)[0]
+    torch.testing.assert_close(found.history, torch.stack(losses))
+    assert found.kept.tolist() == [3, 3]
+
+
+def test_the_best_codes_are_kept_when_the_descent_overshoots(model: Generator, images: torch.Tensor) -> None:
+    wild = InferenceConfig(groups=1, steps=12, step_size=3_000.0)
+    last, best = (
+        reconstruct(model, images, settings=dataclasses.replace(wild, keep_best=keep))
+        for keep in (False, True)
+    )
+    torch.testing.assert_close(last.history, best.history)
+    assert (last.history[-1] > last.history.amin(0)).any(), "these steps are meant to overshoot"
+    assert torch.equal(best.kept, best.history.argmin(0))
+    assert last.kept.tolist() == [12, 12]
+    for found in (last, best):
+        clouds = found.points.unflatten(1, (3, model.points))
+        kept = found.history.gather(0, found.kept[None])[0]
+        torch.testing.assert_close(100 * consistency_loss(clouds, reduction="none"), kept)
+
+
+def test_each_object_stops_when_its_own_loss_no_longer_falls(model: Generator, images: torch.Tensor) -> None:
+    patient = InferenceConfig(groups=1, steps=20, step_size=1.0)
+    whole = reconstruct(model, images, settings=patient).history
+    drops = -whole.diff(dim=0)
+    # A threshold between the two objects' first drops: one object stops at once, the other goes on.
+    order = drops[0].argsort()
+    threshold = drops[0].mean().item()
+    stopping = dataclasses.replace(patient, patience=1, min_drop=threshold)
+    found = reconstruct(model, images, settings=stopping)
+    assert found.kept[order[0]] == 1
+    assert found.kept[order[1]] > 1
+    assert len(found.history) == 1 + found.kept.max()
+    for shape, step in enumerate(found.kept.tolist()):
+        torch.testing.assert_close(found.history[: step + 1, shape], whole[: step + 1, shape])
+        assert (found.history[step:, shape] == found.history[step, shape]).all()
+
+
+def test_restraints_hold_the_codes_near_where_they_were_drawn(model: Generator, images: torch.Tensor) -> None:
+    far = InferenceConfig(groups=1, steps=6, step_size=50.0)
+    start = reconstruct(model, images, groups=1, steps=0).codes.norm(dim=-1)
+    free = reconstruct(model, images, settings=far).codes.norm(dim=-1)
+    held = reconstruct(model, images, settings=dataclasses.replace(far, keep_norm=True)).codes.norm(dim=-1)
+    pulled = reconstruct(model, images, settings=dataclasses.replace(far, prior=0.01)).codes.norm(dim=-1)
+    assert not torch.allclose(free, start, rtol=1e-3)
+    torch.testing.assert_close(held, start)
+    assert (pulled < free).all()
+
+
+def test_parts_of_a_batch_make_the_whole(
+    model: Generator, images: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopping = InferenceConfig(groups=2, steps=5, step_size=1.0, patience=1, min_drop=0.05)
+    whole = reconstruct(model, images, settings=stopping)
+    monkeypatch.setattr("train.inference._POINTS_AT_ONCE", 1)
+    in_parts = reconstruct(model, images, settings=stopping)
+    assert torch.equal(whole.kept, in_parts.kept)
+    assert len(set(whole.kept.tolist())) == 2, "the parts are meant to stop at different steps"
+    # The network rounds differently at another batch size, and nearest points may change with it.
+    torch.testing.assert_close(whole.history, in_parts.history, rtol=1e-3, atol=0)
+    torch.testing.assert_close(whole.points, in_parts.points, rtol=0, atol=5e-3)
+
+
+def test_two_dozen_views_agree(model: Generator) -> None:
+    images = torch.rand(24, 3, 48, 64, generator=torch.Generator().manual_seed(2))
+    found = reconstruct(model, images, groups=2, steps=2, step_size=2.0)
+    assert found.points.shape == (1, 24 * model.points, 3)
+    assert found.history[-1] < found.history[0]
+
+
+def test_arguments_go_before_settings(model: Generator, images: torch.Tensor) -> None:
+    settings = InferenceConfig(groups=1, steps=7, step_size=0.3)
+    found = reconstruct(model, images, steps=2, settings=settings)
+    assert len(found.history) == 3
+    assert torch.equal(found.codes, reconstruct(model, images, groups=1, steps=2, step_size=0.3).codes)
+    assert len(reconstruct(model, images[:1, :2]).history) == 31, "30 steps when nothing is said"
+
+
 def test_wrong_arguments_are_named(model: Generator) -> None:
     with pytest.raises(ValueError, match=r"'images' must be .* got \(3, 48, 64\)"):
         reconstruct(model, torch.ones(3, 48, 64))
+    with pytest.raises(ValueError, match="'images' must be"):
+        reconstruct(model, torch.ones(0, 3, 48, 64))
     with pytest.raises(ValueError, match="groups >= 1"):
         reconstruct(model, torch.ones(2, 3, 48, 64), groups=0)
+    with pytest.raises(ValueError, match=r"patience >= 0; got 5, 30 and -1"):
+        reconstruct(model, torch.ones(2, 3, 48, 64), settings=InferenceConfig(patience=-1))

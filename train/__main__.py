@@ -1,4 +1,4 @@
-"""The command line: `python -m train data|fit|reconstruct|evaluate|demo`."""
+"""The command line: `python -m train data|fit|reconstruct|evaluate|experiment|demo`."""
 
 from __future__ import annotations
 
@@ -16,12 +16,30 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from train.config import PROFILES, FitConfig, fit_config_from_json
 from train.errors import UserError
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
+
+
+def _numbers(words: list[str]) -> tuple[int, ...]:
+    return tuple(int(number) for word in words for number in word.split(",") if number)
+
+
+Numbers = Annotated[
+    tuple[int, ...],
+    PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="INT,...",
+        instance_from_str=_numbers,
+        is_instance=lambda value: isinstance(value, tuple) and all(isinstance(n, int) for n in value),
+        str_from_instance=lambda value: [",".join(map(str, value))],
+    ),
+]
+"""Whole numbers, given as `1,2,4` or as `1 2 4`."""
 
 
 @dataclasses.dataclass
@@ -152,7 +170,8 @@ class Reconstruct:
     """
 
     model: Annotated[Positional[Path], arg(metavar="RUN")]
-    """A run's directory, or a .safetensors file of one."""
+    """A run's directory, a .safetensors file of one, or the word `pretrained`: the weights that come with this
+    repository."""
     images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")]
     """Pictures of one object."""
     out: Path
@@ -174,18 +193,22 @@ class Reconstruct:
 
 @dataclasses.dataclass
 class Evaluate:
-    """Score a run on held-out shapes, beside two answers that need no network; writes evaluation.json."""
+    """Score a run on held-out shapes, beside two answers that need no network; writes evaluation.json.
+
+    Distances are un-squared and x100. F at 1%: the F-score with a threshold of 0.01 world units, 1 % of an object's
+    size. EMD: after both clouds are thinned to the size of one prediction.
+    """
 
     model: Annotated[Positional[Path], arg(metavar="RUN")]
-    """A run's directory, or a .safetensors file of one."""
+    """A run's directory, a .safetensors file of one, or the word `pretrained`."""
     data: Path
     """Root of a data tree."""
     split: Literal["train", "val", "test"] = "test"
     """Split to score."""
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: Numbers = (0, 1, 2)
     """Seeds of codes and choice of views; the figures are means over them."""
-    views: tuple[int, ...] = (1, 2, 4, 8)
-    """Numbers of views."""
+    views: Numbers = (1, 2, 4, 8)
+    """Numbers of views, as 1,2,4,8 or apart."""
     limit: int | None = None
     """Score at most that many shapes."""
     out: Path | None = None
@@ -202,6 +225,42 @@ class Evaluate:
             views=self.views,
             limit=self.limit,
             out=self.out,
+        )
+
+
+@dataclasses.dataclass
+class Experiment:
+    """Answer one question by measurement; writes NAME.json, NAME.md and NAME.png into --out.
+
+    agreement: what search and descent on the codes do to the error, for step sizes, steps, groups and restraints.
+    """
+
+    name: Positional[Literal["agreement"]]
+    """Which one."""
+    run_: Annotated[Path, arg(name="run")]
+    """The trained run it is about: a directory, a .safetensors file, or the word `pretrained`."""
+    data: Path
+    """Root of a data tree."""
+    out: Path
+    """Directory to write to."""
+    seeds: Numbers = (0, 1, 2)
+    """Seeds of codes and choice of views."""
+    views: int = 8
+    """Views per shape."""
+    limit: int | None = None
+    """Use at most that many test shapes."""
+
+    def run(self) -> None:
+        from train.experiments import run_experiment
+
+        run_experiment(
+            self.name,
+            run=self.run_,
+            data=self.data,
+            out=self.out,
+            seeds=self.seeds,
+            views=self.views,
+            limit=self.limit,
         )
 
 
@@ -242,6 +301,7 @@ def _parse(arguments: list[str]) -> Any:
         | Annotated[Fit, subcommand("fit", default=fit)]
         | Annotated[Reconstruct, subcommand("reconstruct")]
         | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Experiment, subcommand("experiment")]
         | Annotated[Demo, subcommand("demo")]
     )
     return tyro.cli(

@@ -196,6 +196,8 @@ def errors_figure(result: dict[str, Any]) -> Figure:
         ("generator, random codes", result["random_codes"], "o--"),
         ("nearest training shape by image", result["nearest_image"], "s-"),
     ):
+        if not rows:
+            continue
         colour = "#a4562a" if style[0] == "s" else "#1f6f8b"
         axes.plot(
             [int(n) for n in rows], [row["cd"] for row in rows.values()], style, color=colour, label=label

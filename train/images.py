@@ -13,6 +13,9 @@ from torch.nn import functional as F
 
 from train.errors import UserError
 
+_SMALLEST = 16
+_WHITE_ENOUGH = 0.85
+
 
 def read_images(paths: Sequence[Path], *, size: int = 224) -> Tensor:
     """Reads pictures of one object, composites transparency on white and pads each to a centred square.
@@ -25,7 +28,7 @@ def read_images(paths: Sequence[Path], *, size: int = 224) -> Tensor:
         (V, 3, size, size) float32 in [0, 1].
 
     Raises:
-        UserError: a file is missing or is no image.
+        UserError: a file is missing, is no image, or is too small to show anything.
     """
     squares = [_square(_read(path)) for path in paths]
     return torch.cat(
@@ -44,13 +47,37 @@ def _read(path: Path) -> Tensor:
         with Image.open(path) as file:
             # Cameras note how they were held instead of turning the pixels.
             image = ImageOps.exif_transpose(file)
-            if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16", "F"):
-                image = image.convert("RGBA")
-            pixels = np.atleast_3d(np.asarray(image))
+            pixels = _pixels(image)
+        if not np.isfinite(pixels).all():
+            raise ValueError("some pixels are not finite")
     except Exception as error:  # every decoder has its own exceptions; all mean that this is no image
         reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
         raise UserError(f"{path} is not an image that can be read ({reason})") from None
+    height, width = pixels.shape[:2]
+    if min(height, width) < _SMALLEST:
+        raise UserError(
+            f"{path} is {width} x {height} pixels; at least {_SMALLEST} x {_SMALLEST} are needed to show an object"
+        )
     return on_white(pixels)
+
+
+def _pixels(image: Image.Image) -> np.ndarray:
+    """(H, W, channels), grey or colour with or without alpha, in one of the types that `on_white` scales."""
+    if image.mode.startswith("I"):  # 16 bits of grey; older versions of Pillow widen them to 32
+        return np.asarray(image).clip(0, 65535).astype(np.uint16)[..., None]
+    if image.mode not in ("L", "LA", "RGB", "RGBA", "F"):
+        image = image.convert("RGBA")
+    return np.atleast_3d(np.asarray(image))
+
+
+def on_dark(images: Tensor) -> list[int]:
+    """Numbers of the square images (V, 3, S, S) of which two sides or more are not white: a background is there.
+
+    One side may be the object's, and two the white that made the picture square.
+    """
+    sides = torch.stack([images[..., 0, :], images[..., -1, :], images[..., 0], images[..., -1]])
+    second_darkest = sides.mean(2).median(2).values.sort(0).values[1]
+    return [i for i, value in enumerate(second_darkest.tolist()) if value < _WHITE_ENOUGH]
 
 
 def on_white(pixels: np.ndarray) -> Tensor:

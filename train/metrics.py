@@ -7,14 +7,26 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffpoint import chamfer_distance, farthest_point_sample
+from diffpoint import earth_mover_distance, farthest_point_sample, nearest
+
+FSCORE_DISTANCE = 0.01
+"""World units, that is 1 % of an object's size: how near counts as found."""
+_EMD_TOLERANCE = 0.02
 
 
 class CloudErrors(NamedTuple):
-    """Distances x100 between predictions and ground truth, one value per cloud."""
+    """What separates predictions from ground truth, one value per cloud; distances x100.
+
+    Attributes:
+        gt_to_pred: (*B) mean distance from a true point to the prediction.
+        pred_to_gt: (*B) mean distance from a predicted point to the truth.
+        fscore: (*B) harmonic mean of the shares of true and of predicted points with the other cloud within
+            `FSCORE_DISTANCE`, in [0, 1]. Two samplings of one surface reach 1 only if they are as dense as that.
+    """
 
     gt_to_pred: Tensor
     pred_to_gt: Tensor
+    fscore: Tensor
 
     @property
     def cd(self) -> Tensor:
@@ -24,8 +36,27 @@ class CloudErrors(NamedTuple):
 
 def cloud_errors(predicted: Tensor, truth: Tensor) -> CloudErrors:
     """Compares clouds (*B, N, 3) with clouds (*B, M, 3)."""
-    distance = chamfer_distance(predicted, truth, squared=False)
-    return CloudErrors(gt_to_pred=100 * distance.b_to_a, pred_to_gt=100 * distance.a_to_b)
+    to_truth = nearest(predicted, truth).squared_distance.sqrt()
+    to_prediction = nearest(truth, predicted).squared_distance.sqrt()
+    precision, recall = ((d <= FSCORE_DISTANCE).to(d.dtype).mean(-1) for d in (to_truth, to_prediction))
+    return CloudErrors(
+        gt_to_pred=100 * to_prediction.mean(-1),
+        pred_to_gt=100 * to_truth.mean(-1),
+        fscore=2 * precision * recall / (precision + recall).clamp(min=1e-12),
+    )
+
+
+def transport_error(predicted: Tensor, truth: Tensor, *, points: int) -> Tensor:
+    """(*B) mean earth mover's distance x100, within 2 % of the least, between both clouds thinned to equal size.
+
+    Args:
+        predicted: (*B, N, 3).
+        truth: (*B, M, 3).
+        points: to how many points, at most; both clouds are thinned by farthest point sampling.
+    """
+    points = min(points, predicted.shape[-2], truth.shape[-2])
+    pair = thin_out(predicted, points), thin_out(truth, points)
+    return 100 * earth_mover_distance(*pair, tolerance=_EMD_TOLERANCE).cost
 
 
 def thin_out(clouds: Tensor, count: int) -> Tensor:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from diffpoint.io import write_points
-from train.checkpoint import config_of, load_generator
 from train.errors import UserError
 from train.files import replacing
-from train.images import read_images
+from train.images import on_dark, read_images
 from train.inference import reconstruct
+from train.runs import open_run
 
 MOST_IMAGES = 24
 
@@ -37,18 +38,21 @@ def reconstruct_to_files(
         raise UserError(f"reconstruct takes 1 to {MOST_IMAGES} images; got {len(images)}")
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is a file; --out names a directory")
-    model = load_generator(run)
-    inference = config_of(run, model).inference
-    groups = inference.groups if groups is None else groups
-    steps = inference.steps if steps is None else steps
-    if groups < 1 or steps < 0:
+    if (groups is not None and groups < 1) or (steps is not None and steps < 0):
         raise UserError(f"--groups must be at least 1 and --steps at least 0; got {groups} and {steps}")
     pictures = read_images(images)
-    found = reconstruct(model, pictures, groups=groups, steps=steps, seed=seed, step_size=inference.step_size)
+    if dark := on_dark(pictures):
+        names = ", ".join(str(images[i]) for i in dark)
+        print(
+            f"note: {names}: the border is not white; the network expects the object alone, on white or transparent",
+            file=sys.stderr,
+        )
+    model, config, _ = open_run(run)
+    found = reconstruct(model, pictures, groups=groups, steps=steps, seed=seed, settings=config.inference)
     points = found.points[0]
     made = f"{len(points)} points from {len(images)} image{'s' if len(images) > 1 else ''}"
     if len(found.history):
-        before, after = found.history[0, 0].item(), found.history[-1, 0].item()
+        before, after = found.history[0, 0].item(), found.history[found.kept[0], 0].item()
         made += f"; the views' disagreement (chamfer x100) fell from {before:.2f} to {after:.2f}"
 
     with replacing(out / "reconstruction.html") as page:

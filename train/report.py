@@ -106,15 +106,7 @@ def make_example(model: Generator, shape: Shape, config: FitConfig, *, seed: int
     )  # objects face +z: their backs are what this view hides
     codes = torch.randn(_CODES, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
     predictions = model(shape.images[chosen : chosen + 1], codes)[:, 0]
-    settings = config.inference
-    found = reconstruct(
-        model,
-        shape.images,
-        groups=settings.groups,
-        steps=settings.steps,
-        seed=seed,
-        step_size=settings.step_size,
-    )
+    found = reconstruct(model, shape.images, seed=seed, settings=config.inference)
     images, camera = figures.close_up(shape.images, shape.camera, shape.points)
     return Example(images, camera, chosen, predictions, found.points[0], shape.points)
 

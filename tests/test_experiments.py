@@ -1,0 +1,81 @@
+"""Experiments: what they measure is what they write, on paper and in JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from models import build_generator
+from train.checkpoint import save_weights
+from train.config import InferenceConfig
+from train.errors import UserError
+from train.evaluate import evaluate
+from train.experiments import EXPERIMENTS, run_experiment
+from train.experiments.agreement import WAYS, agreement
+
+_WAYS = {
+    "random codes": InferenceConfig(groups=1, steps=0),
+    "searched": InferenceConfig(groups=3, steps=0),
+    "descended": InferenceConfig(groups=3, steps=3, step_size=1.0),
+}
+
+
+def test_agreement_writes_what_it_measured(smoke_run: Path, tiny_data: Path, tmp_path: Path) -> None:
+    found = agreement(
+        smoke_run, tiny_data, tmp_path, seeds=(0, 1), views=3, limit=2, progress=False, ways=_WAYS
+    )
+    assert json.loads((tmp_path / "agreement.json").read_text()) == json.loads(json.dumps(found))
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        f"agreement.{kind}" for kind in ("json", "md", "png")
+    ]
+    loss = {name: way["mean"]["consistency"] for name, way in found["ways"].items()}
+    assert loss["descended"] < loss["searched"] < loss["random codes"]
+    assert found["ways"]["descended"]["lowered_share"] == 1
+    assert found["ways"]["searched"]["lowered_share"] is None
+    assert found["ways"]["random codes"]["against_random"]["cd"] == {"mean": 0, "standard_error": 0}
+    change = found["ways"]["descended"]["against_random"]["fps_cd"]["mean"]
+    means = [found["ways"][name]["mean"]["fps_cd"] for name in ("descended", "random codes")]
+    assert change == pytest.approx(means[0] - means[1], abs=1e-4)
+    assert all(-1 <= r <= 1 for pair in found["correlation"].values() for r in pair.values())
+    text = (tmp_path / "agreement.md").read_text()
+    assert f"| {loss['descended']:.2f} |" in text
+    assert f"disagree by {found['floor']:.2f}" in text
+    with Image.open(tmp_path / "agreement.png") as picture:
+        assert picture.size[0] > 1000
+
+
+def test_random_codes_are_those_of_the_evaluation(smoke_run: Path, tiny_data: Path, tmp_path: Path) -> None:
+    found = agreement(
+        smoke_run, tiny_data, tmp_path, seeds=(0,), views=2, progress=False,
+        ways={"random codes": _WAYS["random codes"]},
+    )  # fmt: skip
+    scored = evaluate(smoke_run, tiny_data, views=(2,), out=tmp_path / "evaluation.json", progress=False)
+    assert found["ways"]["random codes"]["mean"] == pytest.approx(scored["random_codes"]["2"])
+
+
+def test_the_paper_s_setting_is_among_the_ways() -> None:
+    assert InferenceConfig(groups=5, steps=30, step_size=0.5) in WAYS.values()
+    assert WAYS["random codes"] == InferenceConfig(groups=1, steps=0)
+
+
+@pytest.mark.parametrize("views", [1, 5])
+def test_a_wrong_number_of_views_is_refused(
+    views: int, smoke_run: Path, tiny_data: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match=rf"between 2 and the 4 that .* got {views}"):
+        run_experiment("agreement", run=smoke_run, data=tiny_data, out=tmp_path, views=views, progress=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_network_without_codes_is_refused(tiny_data: Path, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    weights = tmp_path / "plain.safetensors"
+    save_weights(build_generator("smoke", deterministic=True), weights)
+    for name in EXPERIMENTS:
+        with pytest.raises(UserError, match="takes no codes"):
+            run_experiment(name, run=weights, data=tiny_data, out=tmp_path / "out", progress=False)
+    assert not (tmp_path / "out").exists()

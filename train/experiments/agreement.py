@@ -1,0 +1,269 @@
+"""Does agreement help? What search and descent on the codes do to the error, and why.
+
+Every way of choosing codes is scored on the same shapes, views and first random codes. Beside them:
+
+- the floor: the consistency loss between random samples of the TRUE shape, as large as one prediction. Predictions
+  that all lay on the true surface would still disagree by about that much, because their points do not coincide;
+  a descent that goes on makes points coincide, and the joined cloud covers less.
+- the correlation of disagreement and error, over groups of random codes of one shape and over shapes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+from tqdm import tqdm
+
+from diffpoint import consistency_loss
+from models import Generator
+from train import figures
+from train.batches import LoadedSplit, load_split
+from train.config import InferenceConfig
+from train.errors import UserError
+from train.files import write_text
+from train.runs import open_run
+from train.scoring import Scores, means, score, spreads, stacked
+
+_RANDOM = "random codes"
+WAYS: dict[str, InferenceConfig] = {
+    _RANDOM: InferenceConfig(groups=1, steps=0),
+    "best of 5 groups": InferenceConfig(groups=5, steps=0),
+    "best of 20 groups": InferenceConfig(groups=20, steps=0),
+    "descent alone, 30 x 0.1": InferenceConfig(groups=1, steps=30, step_size=0.1),
+    "best of 5, 10 x 0.1": InferenceConfig(steps=10, step_size=0.1),
+    "best of 5, 30 x 0.02": InferenceConfig(steps=30, step_size=0.02),
+    "best of 5, 30 x 0.1": InferenceConfig(steps=30, step_size=0.1),
+    "best of 5, 30 x 0.5 (the paper's)": InferenceConfig(steps=30, step_size=0.5),
+    "best of 5, 30 x 1.0": InferenceConfig(steps=30, step_size=1.0),
+    "best of 5, 100 x 0.1": InferenceConfig(steps=100, step_size=0.1),
+    "30 x 0.5, codes of constant length": InferenceConfig(steps=30, step_size=0.5, keep_norm=True),
+    "30 x 0.5, pulled to N(0, 1)": InferenceConfig(steps=30, step_size=0.5, prior=0.02),
+}
+_GROUPS = 20
+_COLUMNS = {
+    "consistency": "consistency",
+    "gt_to_pred": "GT->pred",
+    "pred_to_gt": "pred->GT",
+    "cd": "CD",
+    "fps_gt_to_pred": "FPS GT->pred",
+    "fps_pred_to_gt": "FPS pred->GT",
+    "fps_cd": "FPS-CD",
+}
+
+
+def agreement(
+    run: Path,
+    data: Path,
+    out: Path,
+    *,
+    seeds: Sequence[int],
+    views: int,
+    limit: int | None = None,
+    progress: bool = True,
+    ways: dict[str, InferenceConfig] = WAYS,
+) -> dict[str, Any]:
+    """Scores every way of choosing codes; writes agreement.json, .md and .png into `out`.
+
+    Args:
+        run: a run whose network takes codes.
+        data: root of a data tree; its test split is used.
+        out: directory to write to.
+        seeds: of codes and choice of views.
+        views: per shape, at least 2.
+        limit: at most that many shapes.
+        progress: show a bar, and the table at the end.
+        ways: name -> settings; must hold "random codes".
+
+    Returns:
+        What agreement.json holds.
+    """
+    model, config, _ = open_run(run)
+    if model.config.deterministic:
+        raise UserError(f"{run} takes no codes: there is nothing to agree on by choosing them")
+    size = (model.config.image_height, model.config.image_width)
+    test = load_split(
+        data,
+        "test",
+        image_size=size,
+        map_size=config.map_size,
+        gt_pool=config.gt_pool,
+        categories=config.categories,
+        limit=limit,
+        progress=progress,
+    )
+    if not 2 <= views <= test.views:
+        raise UserError(f"--views must be between 2 and the {test.views} that {data} has; got {views}")
+    if len(test) < 2:
+        raise UserError(f"one test shape has no spread; {data} or --limit must give at least 2")
+    if not seeds:
+        raise UserError("--seeds needs at least one number")
+
+    scores: dict[str, Scores] = {}
+    with tqdm(
+        total=len(test) * len(seeds) * (len(ways) + _GROUPS), unit="shape", disable=not progress
+    ) as bar:
+        for name, settings in ways.items():
+            bar.set_description(name)
+            scores[name] = stacked(
+                [score(model, test, settings, views=views, seed=seed, done=bar.update) for seed in seeds]
+            )
+        bar.set_description(f"{_GROUPS} groups of codes")
+        groups = _random_groups(model, test, views=views, count=_GROUPS * len(seeds), done=bar.update)
+
+    result: dict[str, Any] = {
+        "run": str(run),
+        "profile": config.profile,
+        "config": dataclasses.asdict(config),
+        "data": {"path": str(data), "shapes": len(test), "fingerprint": test.fingerprint},
+        "seeds": list(seeds),
+        "views": views,
+        "floor": _floor(test, points=model.points, clouds=views),
+        "ways": {
+            name: {
+                "settings": dataclasses.asdict(ways[name]),
+                "mean": means(found),
+                "sd_over_seeds": spreads(found),
+                "against_random": _against(found, scores[_RANDOM]),
+                "lowered_share": _lowered(found) if ways[name].steps else None,
+                "code_norm": found["code_norm"].mean().item(),
+            }
+            for name, found in scores.items()
+        },
+        "correlation": _correlation(groups),
+    }
+    write_text(out / "agreement.json", json.dumps(result, indent=2) + "\n")
+    write_text(out / "agreement.md", _markdown(result))
+    figures.save(_figure(result, groups), out / "agreement.png")
+    if progress:
+        print(_markdown(result))
+    return result
+
+
+def _random_groups(model: Generator, test: LoadedSplit, *, views: int, count: int, done: Any) -> Scores:
+    """(G, M) scores of many groups of random codes for the same views of each shape."""
+    random = InferenceConfig(groups=1, steps=0)
+    return stacked(
+        [
+            score(model, test, random, views=views, seed=0, code_seed=1 + group, done=done)
+            for group in range(count)
+        ]
+    )
+
+
+def _floor(test: LoadedSplit, *, points: int, clouds: int) -> float:
+    """Mean consistency loss x100 of disjoint random samples of the true clouds; fewer if they run out of points."""
+    generator = torch.Generator().manual_seed(0)
+    clouds = min(clouds, test.points.shape[1] // points)
+    if clouds < 2:
+        raise UserError(
+            f"the true clouds have {test.points.shape[1]} points, too few for two samples of {points}"
+        )
+    shuffled = torch.stack([cloud[torch.randperm(len(cloud), generator=generator)] for cloud in test.points])
+    return 100 * consistency_loss(shuffled[:, : clouds * points].unflatten(1, (clouds, points))).item()
+
+
+def _against(found: Scores, random: Scores) -> dict[str, dict[str, float]]:
+    """Change against random codes: mean, and standard error over shapes."""
+    changes = {name: (found[name] - random[name]).double().mean(0) for name in _COLUMNS}
+    return {
+        name: {"mean": change.mean().item(), "standard_error": (change.std() / len(change) ** 0.5).item()}
+        for name, change in changes.items()
+    }
+
+
+def _lowered(found: Scores) -> float:
+    return (found["consistency"] < found["searched"]).double().mean().item()
+
+
+def _correlation(groups: Scores) -> dict[str, dict[str, float]]:
+    """Pearson's r of the consistency loss with each error: over groups within a shape, and over shapes."""
+
+    def pearson(a: Tensor, b: Tensor) -> Tensor:
+        a, b = a - a.mean(0), b - b.mean(0)
+        return ((a * b).sum(0) / (a.square().sum(0) * b.square().sum(0)).sqrt().clamp(min=1e-12)).clamp(-1, 1)
+
+    disagreement = groups["consistency"].double()
+    found = {}
+    for name in _COLUMNS:
+        if name == "consistency":
+            continue
+        error = groups[name].double()
+        found[name] = {
+            "within_shapes": pearson(disagreement, error).mean().item(),
+            "across_shapes": pearson(disagreement.mean(0), error.mean(0)).item(),
+        }
+    return found
+
+
+def _markdown(result: dict[str, Any]) -> str:
+    header = ["codes", *_COLUMNS.values(), "CD - random", "FPS-CD - random", "lowered"]
+    lines = [_row(header), _row(["---", *["---:"] * (len(header) - 1)])]
+    for name, way in result["ways"].items():
+        cells = [f"{way['mean'][column]:.2f}" for column in _COLUMNS]
+        for column in ("cd", "fps_cd"):
+            change = way["against_random"][column]
+            cells.append("" if name == _RANDOM else f"{change['mean']:+.3f} ± {change['standard_error']:.3f}")
+        lowered = way["lowered_share"]
+        lines.append(_row([name, *cells, "" if lowered is None else f"{lowered:.1%}"]))
+    correlations = [
+        _row(["correlation of disagreement with", "over groups of codes, within a shape", "over shapes"]),
+        _row(["---", "---:", "---:"]),
+        *(
+            _row([_COLUMNS[name], f"{r['within_shapes']:+.2f}", f"{r['across_shapes']:+.2f}"])
+            for name, r in result["correlation"].items()
+        ),
+    ]
+    spread = max(way["sd_over_seeds"]["cd"] or 0.0 for way in result["ways"].values())
+    head = (
+        f"{result['data']['shapes']} test shapes, {result['views']} views, seeds "
+        f"{', '.join(map(str, result['seeds']))}; un-squared distances x100. Changes against random codes with their "
+        f"standard error over shapes; CD varies over seeds by at most {spread:.3f} (sd). Lowered: share of "
+        "reconstructions whose consistency loss the descent lowered. Samples of the true shape, as large as one "
+        f"prediction, disagree by {result['floor']:.2f}."
+    )
+    return "\n".join([head, "", *lines, "", *correlations, ""])
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _figure(result: dict[str, Any], groups: Scores) -> Figure:
+    """Left: what each way does to the error and to the disagreement. Right: both over random groups of codes."""
+    figure = Figure(figsize=(12, 4.8), layout="constrained", dpi=110)
+    left, right = figure.subplots(1, 2)
+    ways = result["ways"]
+    order = sorted(ways, key=lambda name: ways[name]["mean"]["consistency"])
+    disagreement = [ways[name]["mean"]["consistency"] for name in order]
+    for column, colour in (("cd", "#1f6f8b"), ("fps_cd", "#c8553d")):
+        errors = [ways[name]["mean"][column] for name in order]
+        left.plot(disagreement, errors, "o-", color=colour, label=_COLUMNS[column])
+    left.axvline(result["floor"], color=figures.MUTED, ls=":", label="samples of the true shape")
+    left.set(
+        xlabel="consistency loss x100", ylabel="chamfer distance x100", title="Every way of choosing codes"
+    )
+    left.legend(fontsize=9)
+
+    def centred(name: str) -> Tensor:
+        return (groups[name] - groups[name].mean(0)).flatten()
+
+    for column, colour in (("cd", "#1f6f8b"), ("fps_cd", "#c8553d")):
+        r = result["correlation"][column]["within_shapes"]
+        right.plot(
+            centred("consistency"), centred(column), ".", ms=3, alpha=0.4, color=colour,
+            label=f"{_COLUMNS[column]}, r = {r:+.2f}",
+        )  # fmt: skip
+    right.set(
+        xlabel="consistency loss, less the shape's mean",
+        ylabel="error, less the shape's mean",
+        title="Groups of random codes",
+    )
+    right.legend(fontsize=9)
+    return figure

@@ -1,0 +1,49 @@
+"""What a user may name as a run: a directory of `fit`, a file of weights, or the word `pretrained`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from models import Generator
+from train.checkpoint import config_of, load_generator
+from train.config import FitConfig
+from train.errors import UserError
+
+PRETRAINED = "pretrained"
+"""The word for the weights that come with the repository; a file or directory of that name goes first."""
+_SHIPPED = Path(__file__).parent / "pretrained"
+
+
+class OpenRun(NamedTuple):
+    """A trained network, how it was trained, and the directory where what is found out about it belongs.
+
+    `folder` is None for the weights that come with the repository.
+    """
+
+    model: Generator
+    config: FitConfig
+    folder: Path | None
+
+
+def open_run(run: Path) -> OpenRun:
+    """Loads the network of a run.
+
+    Args:
+        run: a run's directory, a .safetensors file of one, or `Path("pretrained")`.
+
+    Raises:
+        UserError: there is nothing of the kind, or it cannot be read.
+    """
+    if run != Path(PRETRAINED) or run.exists():
+        model = load_generator(run)
+        return OpenRun(model, config_of(run, model), run if run.is_dir() else run.parent)
+    weights = _SHIPPED / "generator.safetensors"
+    if not weights.exists():
+        raise UserError(
+            f"'{PRETRAINED}' means the weights in {weights}, and there are none; train your own "
+            "(python -m train data procedural --out data --shapes 400 --size 112, then python -m train fit "
+            "--data data --out run, about an hour) and name that run instead"
+        )
+    model = load_generator(weights)
+    return OpenRun(model, config_of(_SHIPPED, model), None)
