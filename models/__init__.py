@@ -1,5 +1,22 @@
 """Networks: images and random codes in, point clouds out. They know nothing of files, data or losses."""
 
-from models.generator import CODE_DIM, PROFILES, Generator, GeneratorConfig, build_generator
+from models.autoencoder import LATENT_DIM, Autoencoder, AutoencoderConfig, build_autoencoder
+from models.critic import Critic, critic_loss, generator_loss, gradient_penalty
+from models.generator import CODE_DIM, PROFILES, Generator, GeneratorConfig, Prediction, build_generator
 
-__all__ = ["CODE_DIM", "PROFILES", "Generator", "GeneratorConfig", "build_generator"]
+__all__ = [
+    "CODE_DIM",
+    "LATENT_DIM",
+    "PROFILES",
+    "Autoencoder",
+    "AutoencoderConfig",
+    "Critic",
+    "Generator",
+    "GeneratorConfig",
+    "Prediction",
+    "build_autoencoder",
+    "build_generator",
+    "critic_loss",
+    "generator_loss",
+    "gradient_penalty",
+]

@@ -4,16 +4,24 @@ The network is the two-branch point set generator of the paper (PSGN's encoder a
 joined to the image features on a grid an eighth of the image's size). One rule sets every size: the grid
 gives the number of points (a quarter from a fully connected branch, the rest two per grid cell), the two
 width factors the channels.
+
+That network ends in points and is the one the authors released. The one they wrote down ends in a code of an
+auto-encoder of shapes, whose frozen decoder makes the points: `ending="latent"`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from models.autoencoder import LATENT_DIM, Autoencoder, ShapeDecoder
+
+Ending = Literal["points", "latent"]
 
 CODE_DIM = 128
 
@@ -33,6 +41,9 @@ class GeneratorConfig:
         trunk_width: factor on the channels of the image trunk and the code branch; 1 is the paper's.
         decoder_width: factor on the channels behind the point where image and code meet; 1 is the paper's.
         deterministic: leave the code branch out; codes are accepted and ignored.
+        ending: "points": a fully connected and a convolutional branch make the points (the released network).
+            "latent": the network ends in an auto-encoder's code, and that one's decoder makes the points; it is
+            given by `adopt_decoder` and never trained here (the network of the paper's text).
     """
 
     profile: str = "cpu"
@@ -41,6 +52,7 @@ class GeneratorConfig:
     trunk_width: float = 0.5
     decoder_width: float = 0.25
     deterministic: bool = False
+    ending: Ending = "points"
 
     def __post_init__(self) -> None:
         if self.image_height % 8 or self.image_width % 8 or min(self.image_height, self.image_width) < 8:
@@ -48,6 +60,8 @@ class GeneratorConfig:
                 "GeneratorConfig: image_height and image_width must be positive multiples of 8; "
                 f"got {self.image_height} x {self.image_width}"
             )
+        if self.ending not in ("points", "latent"):
+            raise ValueError(f"GeneratorConfig: ending must be 'points' or 'latent'; got {self.ending!r}")
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -78,14 +92,19 @@ PROFILES = {
 
 
 def build_generator(
-    profile: str = "cpu", deterministic: bool = False, *, config: GeneratorConfig | None = None
+    profile: str = "cpu",
+    deterministic: bool = False,
+    *,
+    ending: Ending = "points",
+    config: GeneratorConfig | None = None,
 ) -> Generator:
     """Builds a generator with freshly drawn weights (seed torch for reproducible ones).
 
     Args:
         profile: "full" (192 x 256 images, 2048 points), "cpu" (96 x 128, 512) or "smoke" (48 x 64, 128).
         deterministic: build the counterpart without the code branch; it is called the same way.
-        config: sizes of your own; `profile` and `deterministic` are then ignored.
+        ending: "points" (the released network) or "latent" (see `GeneratorConfig`).
+        config: sizes of your own; the other arguments are then ignored.
 
     Example:
         >>> model = build_generator("smoke")
@@ -97,8 +116,20 @@ def build_generator(
             raise ValueError(
                 f"build_generator: 'profile' must be one of {', '.join(PROFILES)}; got {profile!r}"
             )
-        config = dataclasses.replace(PROFILES[profile], deterministic=deterministic)
+        config = dataclasses.replace(PROFILES[profile], deterministic=deterministic, ending=ending)
     return Generator(config)
+
+
+class Prediction(NamedTuple):
+    """What R codes make of B images.
+
+    Attributes:
+        points: (R, B, N, 3) in the world frame.
+        latents: (R, B, LATENT_DIM) the shape codes from which a network with a latent ending made them; or None.
+    """
+
+    points: Tensor
+    latents: Tensor | None
 
 
 class Generator(nn.Module):
@@ -111,8 +142,11 @@ class Generator(nn.Module):
         self.config = config
         self.trunk = _image_trunk(config)
         self.code_branch = None if config.deterministic else _CodeBranch(config)
-        self.decoder = _Decoder(config)
+        self.decoder = _LatentDecoder(config) if config.ending == "latent" else _PointDecoder(config)
         _initialise(self)
+        self.shape_decoder = (
+            ShapeDecoder(config.points).requires_grad_(False) if self.ends_in_latent else None
+        )
         # On a CPU a quarter of the time of a training step; the values are the same.
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
@@ -126,6 +160,17 @@ class Generator(nn.Module):
         """Name of the size this network was built to."""
         return self.config.profile
 
+    @property
+    def ends_in_latent(self) -> bool:
+        """Does an auto-encoder's decoder make the points?"""
+        return self.config.ending == "latent"
+
+    def adopt_decoder(self, autoencoder: Autoencoder) -> None:
+        """Copies the decoder of an auto-encoder of the same number of points into a network with a latent ending."""
+        if self.shape_decoder is None:
+            raise ValueError("Generator: only a network with ending='latent' has a decoder to adopt")
+        self.shape_decoder.load_state_dict(autoencoder.decode.state_dict())
+
     def forward(self, images: Tensor, codes: Tensor) -> Tensor:
         """Predicts R clouds for each of B images; the trunk sees every image once.
 
@@ -136,9 +181,13 @@ class Generator(nn.Module):
         Returns:
             (R, B, N, 3) points in the world frame.
         """
+        return self.predict(images, codes).points
+
+    def predict(self, images: Tensor, codes: Tensor) -> Prediction:
+        """As `forward`, with the shape codes on the way."""
         if images.ndim != 4 or images.shape[1] != 3:
             raise ValueError(f"Generator: 'images' must be (B, 3, H, W) in [0, 1]; got {tuple(images.shape)}")
-        return self.decode(self.encode(images), codes)
+        return self._decode(self.encode(images), codes)
 
     def encode(self, images: Tensor) -> Tensor:
         """(B, 3, H, W) images in [0, 1] -> (B, C, H/8, W/8) features, independent of the codes."""
@@ -150,18 +199,30 @@ class Generator(nn.Module):
 
     def decode(self, features: Tensor, codes: Tensor) -> Tensor:
         """(B, C, h, w) features and (R, B, code_dim) codes -> (R, B, N, 3) points."""
+        return self._decode(features, codes).points
+
+    def _decode(self, features: Tensor, codes: Tensor) -> Prediction:
         if codes.ndim != 3 or codes.shape[1:] != (features.shape[0], self.code_dim):
             raise ValueError(
                 f"Generator: 'codes' must be (R, {features.shape[0]}, {self.code_dim}) to match the images; "
                 f"got {tuple(codes.shape)}"
             )
-        repeats, batch = codes.shape[:2]
+        repeats = len(codes)
         if self.code_branch is None:
-            return self.decoder(features).expand(repeats, batch, self.points, 3)
+            made = self.decoder(features)[None]
+        else:
+            joined = self._join(features, self.code_branch(codes.flatten(0, 1)), repeats)
+            made = self.decoder(joined).unflatten(0, codes.shape[:2])
+        made = made.expand(repeats, *made.shape[1:])
+        if self.shape_decoder is None:
+            return Prediction(made, None)
+        return Prediction(self.shape_decoder(made.flatten(0, 1)).unflatten(0, made.shape[:2]), made)
+
+    @staticmethod
+    def _join(features: Tensor, code_features: Tensor, repeats: int) -> Tensor:
         tiled = features.expand(repeats, *features.shape).flatten(0, 1)
-        joined = torch.cat([tiled, self.code_branch(codes.flatten(0, 1))], dim=1)
-        joined = joined.contiguous(memory_format=torch.channels_last)
-        return self.decoder(joined).unflatten(0, (repeats, batch))
+        joined = torch.cat([tiled, code_features], dim=1)
+        return joined.contiguous(memory_format=torch.channels_last)
 
 
 def _widen(channels: int, factor: float) -> int:
@@ -209,14 +270,13 @@ class _CodeBranch(nn.Module):
         return self.convs(self.spread(codes).unflatten(1, (3, *self.grid)))
 
 
-class _Decoder(nn.Module):
-    """Joined features -> points: down to a bottleneck, then a fully connected and an up-convolving branch."""
+class _Narrowing(nn.Module):
+    """Joined features -> two coarser maps, a bottleneck and a vector: what both endings start with."""
 
     def __init__(self, config: GeneratorConfig) -> None:
         super().__init__()
-        c64, c128, c256, c512 = (_widen(c, config.decoder_width) for c in (64, 128, 256, 512))
-        joined = _widen(128, config.trunk_width) * (1 if config.deterministic else 2)
-        self.down4 = _conv_relu(joined, (c256, 3, 2), (c256, 3, 1), (c256, 3, 1))
+        c256, c512 = (_widen(c, config.decoder_width) for c in (256, 512))
+        self.down4 = _conv_relu(_joined_channels(config), (c256, 3, 2), (c256, 3, 1), (c256, 3, 1))
         self.down5 = _conv_relu(c256, (c512, 3, 2), (c512, 3, 1), (c512, 3, 1), (c512, 3, 1))
         self.bottleneck = _conv_relu(c512, (c512, 5, 2))
 
@@ -225,7 +285,35 @@ class _Decoder(nn.Module):
         self.fc_hidden = nn.Sequential(
             nn.Linear(c512 * rows * columns, hidden[0]), nn.ReLU(), nn.Linear(hidden[0], hidden[1]), nn.ReLU()
         )
-        self.fc_points = nn.Linear(hidden[1], 3 * config.fc_points)
+        self.fc_width = hidden[1]
+
+    def narrow(self, joined: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(B, C, h, w) -> maps of h/2 and h/4, the bottleneck of h/8, a vector of fc_width."""
+        x4 = self.down4(joined)
+        x5 = self.down5(x4)
+        bottleneck = self.bottleneck(x5)
+        return x4, x5, bottleneck, self.fc_hidden(bottleneck.flatten(1))
+
+
+class _LatentDecoder(_Narrowing):
+    """Joined features -> a code of the auto-encoder of shapes."""
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        super().__init__(config)
+        self.latent = nn.Linear(self.fc_width, LATENT_DIM)
+
+    def forward(self, joined: Tensor) -> Tensor:
+        return self.latent(self.narrow(joined)[-1])
+
+
+class _PointDecoder(_Narrowing):
+    """Joined features -> points: a fully connected and an up-convolving branch."""
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        super().__init__(config)
+        c64, c128, c256, c512 = (_widen(c, config.decoder_width) for c in (64, 128, 256, 512))
+        joined = _joined_channels(config)
+        self.fc_points = nn.Linear(self.fc_width, 3 * config.fc_points)
 
         self.up5, self.skip5 = _deconv(c512, c256), _conv(c512, c256)
         self.merge5 = _conv_relu(c256, (c256, 3, 1))
@@ -236,11 +324,8 @@ class _Decoder(nn.Module):
         self.conv_points = _conv(c64, 6)
 
     def forward(self, joined: Tensor) -> Tensor:
-        x4 = self.down4(joined)
-        x5 = self.down5(x4)
-        bottleneck = self.bottleneck(x5)
-
-        fc_points = self.fc_points(self.fc_hidden(bottleneck.flatten(1))).unflatten(1, (-1, 3))
+        x4, x5, bottleneck, vector = self.narrow(joined)
+        fc_points = self.fc_points(vector).unflatten(1, (-1, 3))
 
         x = self.merge5(F.relu(_crop(self.up5(bottleneck), x5) + self.skip5(x5)))
         x = self.merge4(F.relu(_crop(self.up4(x), x4) + self.skip4(x4)))
@@ -249,6 +334,10 @@ class _Decoder(nn.Module):
         x = self.merge3(F.relu(F.relu(_crop(self.up3(x), joined)) + self.skip3(joined)))
         conv_points = self.conv_points(x).permute(0, 2, 3, 1).reshape(len(joined), -1, 3)
         return torch.cat([fc_points, conv_points], dim=1)
+
+
+def _joined_channels(config: GeneratorConfig) -> int:
+    return _widen(128, config.trunk_width) * (1 if config.deterministic else 2)
 
 
 def _deconv(inputs: int, outputs: int) -> nn.ConvTranspose2d:
@@ -267,8 +356,10 @@ def _initialise(model: Generator) -> None:
     get half of it. With the defaults of torch the signal of the image fades through the trunk's eleven layers.
     """
     decoder = model.decoder
-    summed = {decoder.up5, decoder.skip5, decoder.up4, decoder.skip4, decoder.skip3}
-    final = {decoder.fc_points, decoder.conv_points}
+    summed, final = set(), set()
+    if isinstance(decoder, _PointDecoder):
+        summed = {decoder.up5, decoder.skip5, decoder.up4, decoder.skip4, decoder.skip3}
+        final = {decoder.fc_points, decoder.conv_points}
     for module in model.modules():
         if not isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
             continue

@@ -40,7 +40,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     page = demo(out, shapes=8, seed=3, config=_SMOKE, progress=False)
     assert page == out / "report.html"
-    assert len(read_metrics(out / "run")) == 50
+    assert len(read_metrics(out / "run")) == 70
     return out
 
 

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from models import build_generator
-from train.checkpoint import load_checkpoint, load_generator, save_checkpoint, save_weights
+from train.checkpoint import load_generator, load_networks, load_state, save_checkpoint, save_weights
 from train.errors import UserError
 from train.files import replacing
 
@@ -27,7 +27,7 @@ def test_weights_come_back_with_the_network_they_belong_to(deterministic: bool, 
 
 def test_a_run_gives_its_best_weights_and_only_then_the_newest(tmp_path: Path) -> None:
     models = [build_generator("smoke") for _ in range(3)]
-    save_checkpoint(tmp_path, 7, models[0], {})
+    save_checkpoint(tmp_path, 7, {"weights": models[0]}, {})
     for expected, name in zip(models, (None, "best-stage1", "best-stage2"), strict=True):
         if name:
             save_weights(expected, tmp_path / "checkpoints" / f"{name}.safetensors")
@@ -38,9 +38,9 @@ def test_a_run_gives_its_best_weights_and_only_then_the_newest(tmp_path: Path) -
 def test_the_newest_two_checkpoints_are_kept(tmp_path: Path) -> None:
     model = build_generator("smoke")
     for step in (1, 2, 3, 3):
-        save_checkpoint(tmp_path, step, model, {"step": step})
+        save_checkpoint(tmp_path, step, {"weights": model}, {"step": step})
     assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["step-00000002", "step-00000003"]
-    assert load_checkpoint(tmp_path / "checkpoints" / "step-00000003", model) == {"step": 3}
+    assert load_state(tmp_path / "checkpoints" / "step-00000003") == {"step": 3}
 
 
 def test_what_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
@@ -51,7 +51,7 @@ def test_what_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
         ("missing", "does not exist"),
         ("empty", "is not a run"),
         ("noise.safetensors", "holds no generator's weights"),
-        ("other.safetensors", "no diffpoint header"),
+        ("other.safetensors", "no diffpoint.generator header"),
     ):
         with pytest.raises(UserError, match=complaint) as caught:
             load_generator(tmp_path / name)
@@ -60,11 +60,14 @@ def test_what_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
 
 def test_an_unreadable_state_is_named(tmp_path: Path) -> None:
     model = build_generator("smoke")
-    save_checkpoint(tmp_path, 5, model, {})
+    save_checkpoint(tmp_path, 5, {"weights": model}, {})
     directory = tmp_path / "checkpoints" / "step-00000005"
     (directory / "state.pt").write_bytes(b"half a fi")
     with pytest.raises(UserError, match=r"state\.pt cannot be read"):
-        load_checkpoint(directory, model)
+        load_state(directory)
+    (directory / "weights.safetensors").unlink()
+    with pytest.raises(UserError, match=r"weights\.safetensors cannot be read .*delete .*step-00000005"):
+        load_networks(directory, {"weights": model})
 
 
 @pytest.mark.parametrize("kind", ["file", "directory"])

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from diffpoint import PinholeCamera, unproject
-from train.config import EXACT_MEAN_EMD_FROM_PAPER, PROFILES, FitConfig, fit_config_from_json, scaled, to_json
+from train.config import EXACT_MEAN_EMD_FROM_PAPER, PROFILES, fit_config_from_json, scaled, to_json
 from train.errors import UserError
 from train.objective import Scene, arrange_scenes, front_loss
 
@@ -108,6 +108,7 @@ def test_what_is_no_configuration_is_refused(text: str) -> None:
 
 
 def test_scaling_shortens_everything_alike() -> None:
-    config = scaled(FitConfig(PROFILES["cpu"].stage1, PROFILES["cpu"].stage2), 0.25)
+    config = scaled(PROFILES["cpu"], 0.25)
+    assert config.pretrain.steps == PROFILES["cpu"].pretrain.steps // 4
     assert config.stage1.steps == PROFILES["cpu"].stage1.steps // 4
     assert config.stage1.ramp[1] == PROFILES["cpu"].stage1.ramp[1] // 4

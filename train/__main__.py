@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.constructors import PrimitiveConstructorSpec
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+from tyro.constructors import PrimitiveConstructorSpec
 
-from train.config import PROFILES, FitConfig, fit_config_from_json
+from train.config import PROFILES, FitConfig, fit_config_from_json, with_steps, with_variant
 from train.errors import UserError
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
@@ -51,7 +51,7 @@ class Procedural:
     shapes: int = 400
     """How many shapes, over all categories."""
     categories: tuple[str, ...] = ()
-    """Families to draw from, for instance `chair display`; none means all."""
+    """Families to draw from, for instance `chair display`; none means all thirteen."""
     seed: int = 0
     """The same seed gives the same tree."""
     size: int = 224
@@ -106,10 +106,31 @@ class Check:
     data: Positional[Path]
     """Root of the data tree."""
 
-    def run(self) -> None:
+    def run(self) -> int:
         from train.data.check import check_tree
 
-        print(check_tree(self.data).summary())
+        report = check_tree(self.data)
+        print(report.summary())
+        return 1 if report.problems else 0
+
+
+@dataclasses.dataclass
+class Rules:
+    """Measure on fresh objects whether the fronts of the families hide their backs; see docs/families.md."""
+
+    categories: tuple[str, ...] = ()
+    """Families to measure; none means all that have designed ambiguity."""
+    objects: int = 20
+    """Objects of each family."""
+    seed: int = 0
+    """Draws the objects."""
+
+    def run(self) -> int:
+        from train.data.rules import measure
+
+        report = measure(self.categories or None, objects=self.objects, seed=self.seed)
+        print(report.summary())
+        return 1 if report.broken else 0
 
 
 @dataclasses.dataclass
@@ -120,17 +141,19 @@ class Data:
         Annotated[Procedural, subcommand("procedural")]
         | Annotated[Meshes, subcommand("meshes")]
         | Annotated[Check, subcommand("check")]
+        | Annotated[Rules, subcommand("rules")]
     ]
 
-    def run(self) -> None:
-        self.action.run()
+    def run(self) -> int | None:
+        return self.action.run()
 
 
 @dataclasses.dataclass
 class Fit:
-    """Train a generator: stage 1 on single views, then stage 2 on joined views. Ctrl-C saves and leaves.
+    """Train an auto-encoder of shapes, then a generator: stage 1 on single views, stage 2 on joined views.
 
-    The defaults below are those of the profile; put --profile before --help to see another profile's.
+    Ctrl-C saves and leaves. The defaults below are those of the profile and the variant; put --profile and --variant
+    before --help to see another's.
     """
 
     data: Path
@@ -141,7 +164,7 @@ class Fit:
     resume: bool = False
     """Continue the run in --out from its newest checkpoint, to the same bits."""
     steps: int | None = None
-    """The same number of steps for both stages, for a quick trial."""
+    """The same number of steps for every phase, ramps in proportion, for a quick trial."""
 
     def run(self) -> int:
         from train.fit import fit
@@ -150,10 +173,7 @@ class Fit:
         if self.steps is not None:
             if self.steps < 1:
                 raise UserError(f"--steps must be at least 1; got {self.steps}")
-            stage1, stage2 = (
-                dataclasses.replace(stage, steps=self.steps) for stage in (config.stage1, config.stage2)
-            )
-            config = dataclasses.replace(config, stage1=stage1, stage2=stage2)
+            config = with_steps(config, self.steps)
         if not fit(self.data, self.out, config, resume=self.resume):
             print(f"stopped early and saved; continue with --resume --out {self.out}", file=sys.stderr)
             return 130
@@ -319,7 +339,8 @@ def _fit_defaults(arguments: list[str]) -> FitConfig:
     saved = Path(given.get("--out", "")) / "config.json"
     if arguments[:1] == ["fit"] and "--resume" in arguments and saved.is_file():
         return fit_config_from_json(saved.read_text(), where=str(saved))
-    return PROFILES.get(given.get("--profile", "cpu"), PROFILES["cpu"])
+    profile = PROFILES.get(given.get("--profile", "cpu"), PROFILES["cpu"])
+    return with_variant(profile, "highly-diverse") if given.get("--variant") == "highly-diverse" else profile
 
 
 if __name__ == "__main__":

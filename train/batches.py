@@ -128,13 +128,25 @@ class LoadedSplit:
         camera = PinholeCamera(self.K[picked], self.cam_from_world[picked], size, size)
         return Batch(self.float_images(shapes, views), self.depth[picked], camera)
 
+    def clouds(self, shapes: Tensor, points: Tensor) -> Tensor:
+        """(B,) shape and (B, N) point numbers -> (B, N, 3) of the ground truth."""
+        return self.points[shapes[:, None], points]
+
 
 class Batch(NamedTuple):
-    """B shapes with V views each: images (B, V, 3, h, w), depth (B, V, S, S), camera (B, V)."""
+    """B shapes with V views each.
+
+    Attributes:
+        images: (B, V, 3, h, w) in [0, 1].
+        depth: (B, V, S, S) metric depth, +inf where empty.
+        camera: (B, V), of the depth maps.
+        real: (B', N, 3) ground truth clouds for the critic: those of the B shapes, then others; None without one.
+    """
 
     images: Tensor
     depth: Tensor
     camera: PinholeCamera
+    real: Tensor | None = None
 
 
 def load_split(
@@ -243,6 +255,11 @@ class Sampler:
         picked = self._random.choice(self._shapes, size=shapes, replace=shapes > self._shapes)
         angles = np.stack([self._random.permutation(self._views)[:views] for _ in range(shapes)])
         return torch.from_numpy(picked), torch.from_numpy(angles)
+
+    def draw_points(self, shapes: int, count: int, *, of: int) -> Tensor:
+        """(B, N) point numbers: for each shape a random `count` of its `of` points, or all of them in any order."""
+        orders = [self._random.permutation(of)[:count] for _ in range(shapes)]
+        return torch.from_numpy(np.stack(orders))
 
     def state(self) -> dict[str, Any]:
         """Everything that decides the next draws."""

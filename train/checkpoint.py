@@ -1,42 +1,62 @@
 """What a run keeps: weights, and beside them the state from which training continues to the same bits.
 
-    RUN/checkpoints/step-00000500/{weights.safetensors, state.pt}   the newest two, for --resume
-    RUN/checkpoints/best-stage1.safetensors, best-stage2.safetensors   chosen on the validation split
+    RUN/checkpoints/step-00000500/{weights,autoencoder,critic}.safetensors, state.pt   the newest, for --resume
+    RUN/checkpoints/best-{autoencoder,stage1,stage2}.safetensors   each phase's, chosen on the validation split
 
-A weights file carries the network's configuration in its header, so that it can be used on its own.
+A weights file carries the network's configuration in its header, so that it can be used on its own. The
+generator's is called weights.safetensors.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
 
-from models import Generator, GeneratorConfig, build_generator
+from models import (
+    Autoencoder,
+    AutoencoderConfig,
+    Critic,
+    Generator,
+    GeneratorConfig,
+    build_autoencoder,
+    build_generator,
+)
 from train.config import PROFILES, FitConfig, fit_config_from_json
 from train.errors import UserError
 from train.files import remove, replacing
 
-_HEADER = "diffpoint.generator"
-_KEPT = 2
+_Network = TypeVar("_Network", bound=nn.Module)
+
+# Under which name a file's header keeps a network's configuration, and how the network is made from it.
+_KINDS = {
+    Generator: ("diffpoint.generator", lambda c: build_generator(config=GeneratorConfig(**c))),
+    Autoencoder: ("diffpoint.autoencoder", lambda c: build_autoencoder(config=AutoencoderConfig(**c))),
+    Critic: ("diffpoint.critic", lambda c: Critic(**c)),
+}
 
 
-def best_weights(run: Path, stage: int) -> Path:
-    """Where stage 1 or 2 keeps its best weights by validation."""
-    return run / "checkpoints" / f"best-stage{stage}.safetensors"
+def best_weights(run: Path, phase: int | str) -> Path:
+    """Where a phase ("autoencoder", stage 1 or 2) keeps its best weights by validation."""
+    name = f"stage{phase}" if isinstance(phase, int) else phase
+    return run / "checkpoints" / f"best-{name}.safetensors"
 
 
-def save_weights(model: Generator, path: Path) -> None:
-    """Writes a generator's weights and configuration, atomically."""
+def save_weights(model: nn.Module, path: Path) -> None:
+    """Writes a network's weights and configuration, atomically."""
+    name, _ = _KINDS[type(model)]
     tensors = {name: value.detach().contiguous() for name, value in model.state_dict().items()}
-    header = {_HEADER: json.dumps(dataclasses.asdict(model.config))}
-    with replacing(path) as temporary:
+    config = getattr(model, "config", None)
+    header = {name: json.dumps(dataclasses.asdict(config) if config else {})}
+    with _space_for(path), replacing(path) as temporary:
         save_file(tensors, temporary, metadata=header)
 
 
@@ -50,11 +70,17 @@ def load_generator(run_or_file: str | Path) -> Generator:
         UserError: there is nothing of the kind, or it cannot be read.
     """
     path = Path(run_or_file)
-    if path.is_dir():
-        path = _weights_of_run(path)
-    elif not path.exists():
-        raise UserError(f"{path} does not exist; name a run that `fit` wrote, or a .safetensors file of one")
-    return _read_generator(path).eval()
+    return _read(_weights_of_run(path) if path.is_dir() else path, Generator).eval()
+
+
+def load_autoencoder(run_or_file: str | Path) -> Autoencoder:
+    """Loads the best auto-encoder of a run, or that of a file, in eval mode and frozen.
+
+    Raises:
+        UserError: there is nothing of the kind, or it cannot be read.
+    """
+    path = Path(run_or_file)
+    return _read(best_weights(path, "autoencoder") if path.is_dir() else path, Autoencoder).freeze()
 
 
 def config_of(run_or_file: str | Path, model: Generator) -> FitConfig:
@@ -72,43 +98,68 @@ def _weights_of_run(run: Path) -> Path:
     for path in candidates:
         if path.exists():
             return path
+    if newest:
+        raise UserError(f"{run} holds no generator yet: its auto-encoder is still being trained")
     raise UserError(
         f"{run} is not a run: it holds no checkpoints/*.safetensors; make one with `fit --out {run}`"
     )
 
 
-def _read_generator(path: Path) -> Generator:
+def _read(path: Path, kind: type[_Network]) -> _Network:
+    name, build = _KINDS[kind]
+    if not path.exists():
+        raise UserError(f"{path} does not exist; name a run that `fit` wrote, or a .safetensors file of one")
     try:
         with safe_open(path, framework="pt") as file:
-            header = (file.metadata() or {}).get(_HEADER)
+            header = (file.metadata() or {}).get(name)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
         if header is None:
-            raise ValueError("it has no diffpoint header")
-        model = build_generator(config=GeneratorConfig(**json.loads(header)))
+            raise ValueError(f"it has no {name} header")
+        model = build(json.loads(header))
         model.load_state_dict(tensors)
     except (SafetensorError, OSError, ValueError, TypeError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise UserError(f"{path} holds no generator's weights ({reason})") from None
+        raise UserError(f"{path} holds no {kind.__name__.lower()}'s weights ({reason})") from None
     return model
 
 
-def save_checkpoint(run: Path, step: int, model: Generator, state: dict[str, Any]) -> None:
-    """Writes one resumable checkpoint, atomically, then drops all but the newest two.
+def save_checkpoint(
+    run: Path, step: int, networks: Mapping[str, nn.Module], state: dict[str, Any], *, keep: int = 2
+) -> None:
+    """Writes one resumable checkpoint, atomically, then drops all but the newest.
 
     Args:
         run: the run's directory.
-        step: steps done, over all stages.
-        model: the generator.
+        step: steps done, over all phases.
+        networks: by the names of their files.
         state: everything else, as tensors, numbers, strings, lists and dicts.
+        keep: how many checkpoints to keep.
+
+    Raises:
+        UserError: it cannot be written; the checkpoints before it are untouched.
     """
     target = run / "checkpoints" / f"step-{step:08d}"
     remove(target)
-    with replacing(target) as directory:
+    with _space_for(target), replacing(target) as directory:
         directory.mkdir()
-        save_weights(model, directory / "weights.safetensors")
+        for name, network in networks.items():
+            save_weights(network, directory / f"{name}.safetensors")
         torch.save(state, directory / "state.pt")
-    for old in _checkpoints(run)[:-_KEPT]:
+    for old in _checkpoints(run)[:-keep]:
         remove(old)
+
+
+@contextmanager
+def _space_for(target: Path) -> Iterator[None]:
+    """Turns a failed write, which torch and safetensors report in their own ways, into words."""
+    try:
+        yield
+    except (OSError, SafetensorError, RuntimeError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise UserError(
+            f"{target} cannot be written ({reason}); what was saved before is untouched: make room and continue "
+            "with --resume"
+        ) from error
 
 
 def latest_checkpoint(run: Path) -> Path | None:
@@ -117,15 +168,37 @@ def latest_checkpoint(run: Path) -> Path | None:
     return checkpoints[-1] if checkpoints else None
 
 
-def load_checkpoint(directory: Path, model: nn.Module) -> dict[str, Any]:
-    """Puts a checkpoint's weights into the model and returns its state."""
-    model.load_state_dict(_read_generator(directory / "weights.safetensors").state_dict())
-    try:
+def load_networks(directory: Path, networks: Mapping[str, nn.Module]) -> None:
+    """Puts a checkpoint's weights into networks of the same sizes.
+
+    Raises:
+        UserError: a part of it is missing or cannot be read.
+    """
+    for name, network in networks.items():
+        with _unreadable(directory, f"{name}.safetensors"):
+            network.load_state_dict(_read(directory / f"{name}.safetensors", type(network)).state_dict())
+
+
+def load_state(directory: Path) -> dict[str, Any]:
+    """A checkpoint's state.
+
+    Raises:
+        UserError: it is missing or cannot be read.
+    """
+    with _unreadable(directory, "state.pt"):
         return torch.load(directory / "state.pt", weights_only=True)
+
+
+@contextmanager
+def _unreadable(directory: Path, name: str) -> Iterator[None]:
+    """Says what to do about a damaged part of a checkpoint."""
+    try:
+        yield
     except Exception as error:  # a damaged pickle fails in every way there is
+        reason = str(error) if isinstance(error, UserError) else type(error).__name__
         raise UserError(
-            f"{directory / 'state.pt'} cannot be read ({type(error).__name__}); delete {directory} to resume "
-            "from the checkpoint before it"
+            f"{directory / name} cannot be read ({reason}); delete {directory} to resume from the checkpoint "
+            "before it"
         ) from None
 
 

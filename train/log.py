@@ -17,15 +17,21 @@ class RunLog:
     Args:
         run: the run's directory.
         step: steps already done; later records, from before a kill, are dropped.
+        writes: False for all but one of a group of processes: everything is dropped.
     """
 
-    def __init__(self, run: Path, *, step: int) -> None:
+    def __init__(self, run: Path, *, step: int, writes: bool = True) -> None:
         self._path = run / "metrics.jsonl"
+        self._events = None
+        if not writes:
+            return
         write_text(self._path, "".join(line for line in _lines(self._path) if _step_of(line) <= step))
         self._events = SummaryWriter(str(run / "events"), purge_step=step + 1)
 
     def write(self, step: int, values: dict[str, Any]) -> None:
         """Records values at a step (counted over all stages)."""
+        if self._events is None:
+            return
         with self._path.open("a") as file:
             file.write(json.dumps({"step": step, **values}) + "\n")
         for name, value in values.items():
@@ -34,7 +40,8 @@ class RunLog:
 
     def close(self) -> None:
         """Flushes the events."""
-        self._events.close()
+        if self._events is not None:
+            self._events.close()
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:

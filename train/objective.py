@@ -6,12 +6,16 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor
 
-from diffpoint import PinholeCamera, chamfer_distance, earth_mover_distance
+from diffpoint import PinholeCamera, chamfer_distance, diversity_loss, earth_mover_distance
 from diffpoint.losses import FrontSets, front_sets
+from train.config import StageConfig
 
 # The stage-1 distance is a sum over the matched points, whose number grows with the map's area; the paper's
 # weights of the other terms belong to maps of 56 x 56.
 _PAPER_MAP_SIZE = 56
+
+# A transport between the joined clouds of many views would take most of a step.
+_JOINED_POINTS = 512
 
 
 class Scene(NamedTuple):
@@ -91,3 +95,29 @@ def front_loss(scene: Scene, distance: Literal["emd", "chamfer"]) -> Front:
 def _matched(sets: FrontSets) -> Tensor:
     """Pairs that an assignment makes: as many as the smaller set has points."""
     return sets.predicted_lengths.minimum(sets.observed_lengths)
+
+
+def spread_loss(codes: Tensor, clouds: Tensor, stage: StageConfig, *, views: int, step: int) -> Tensor:
+    """The diversity loss on a part of the batch and of the points, as the stage says.
+
+    Single-view clouds of one image must differ as much as their codes do; with `stage.joined_diversity`, the joined
+    clouds of a shape as much as the codes of its views do on average (root mean square).
+
+    Args:
+        codes: (R, B*V, code_dim).
+        clouds: (R, B*V, N, 3).
+        stage: its alpha, and how much takes part.
+        views: V.
+        step: which of the strided points take part changes with every step.
+    """
+    if stage.joined_diversity:
+        codes = codes.unflatten(1, (-1, views)).flatten(2) / views**0.5
+        clouds = clouds.unflatten(1, (-1, views)).flatten(2, 3)
+        stride = max(1, clouds.shape[2] // _JOINED_POINTS)
+        every = 1
+    else:
+        stride = stage.diversity_stride
+        # Spread over the batch, so that several processes with a part each take the images that one would take.
+        every = max(1, stage.shapes * stage.views // stage.diversity_images)
+    thin = slice(step % stride, None, stride)
+    return diversity_loss(codes[:, ::every], clouds[:, ::every, thin], alpha=stage.exact_alpha)

@@ -1,91 +1,200 @@
-"""What changes while a run goes on: weights, optimiser, random states, and whether the network still
+"""What changes while a run goes on: weights, optimisers, random states, and whether the network still
 listens."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from models import Generator, build_generator
+from models import PROFILES as SIZES
+from models import Critic, GeneratorConfig, build_autoencoder, build_generator
 from train.batches import Batch, LoadedSplit, Sampler
-from train.checkpoint import best_weights, save_weights
-from train.config import FitConfig, StageConfig
+from train.checkpoint import (
+    best_weights,
+    load_autoencoder,
+    load_generator,
+    load_networks,
+    load_state,
+    save_weights,
+)
+from train.config import FitConfig, PretrainConfig, StageConfig
 from train.errors import UserError
 from train.health import sensitivity
-from train.validation import validate
+from train.laps import Laps
+from train.parallel import ALONE, World
+from train.step import Chance, Learner, autoencoder_step, trainable, training_step
+from train.validation import validate, validate_autoencoder
 
 _DEAF_CHECKS = 3
 
 
 class Training:
-    """Everything that changes while a run goes on, and can be kept and put back."""
+    """Everything that changes while a run goes on, and can be kept and put back.
 
-    def __init__(self, config: FitConfig, train: LoadedSplit) -> None:
+    Args:
+        config: the recipe.
+        train: the training split.
+        world: the group of processes that share each batch. All draw the same random numbers and take their part.
+    """
+
+    def __init__(self, config: FitConfig, train: LoadedSplit, world: World = ALONE) -> None:
         torch.manual_seed(config.seed)
         self.config = config
-        self.model = build_generator(config.profile, config.deterministic)
-        self.sampler = Sampler(len(train), train.views, seed=config.seed)
         self.total_steps = 0
-        self._codes = torch.Generator().manual_seed(config.seed)
-        self._fingerprint = train.fingerprint
-        self.begin_stage(0, None)
+        self.laps = Laps()
+        self._train, self._world = train, world
+        self._sampler = Sampler(len(train), train.views, seed=config.seed)
+        self._random = torch.Generator().manual_seed(config.seed)
+        generator = build_generator(config=size_of(config))
+        autoencoder = build_autoencoder(config.profile)
+        critic = Critic()
+        self.learner = Learner(generator, critic, autoencoder, _adam(autoencoder), _adam(critic))
+        self._enter(next(iter(config.phases)))
 
     @property
-    def stage(self) -> StageConfig:
-        """Settings of the current stage."""
-        return self.config.stages[self.stage_index]
+    def phase(self) -> PretrainConfig | StageConfig:
+        """Settings of the current phase."""
+        return self.config.phases[self.phase_name]
 
-    def begin_stage(self, index: int, weights: Generator | None) -> None:
-        """A fresh optimiser, from the current weights or from others."""
-        if weights is not None:
-            self.model.load_state_dict(weights.state_dict())
-        self.stage_index, self.step = index, 0
+    @property
+    def done(self) -> bool:
+        """Has the current phase made its steps?"""
+        return self.step >= self.phase.steps
+
+    def begin_phase(self, name: str, run: Path) -> None:
+        """A fresh optimiser, from the best weights of the phases before; the critic goes on as it is."""
+        self._world.wait()  # until whoever writes has written them
+        self._enter(name)
+        if name == "stage1" and self.config.needs_autoencoder:
+            self._take_autoencoder(run)
+            if self.learner.generator.ends_in_latent:
+                self.learner.generator.adopt_decoder(self.learner.autoencoder)
+        if name == "stage2":
+            self.learner.generator.load_state_dict(load_generator(best_weights(run, 1)).state_dict())
+
+    def _take_autoencoder(self, run: Path) -> None:
+        found = load_autoencoder(best_weights(run, "autoencoder"))
+        wanted = self.learner.generator.points
+        if self.learner.generator.ends_in_latent and found.config.points != wanted:
+            raise UserError(
+                f"the auto-encoder makes {found.config.points} points, the generator that is to end in it {wanted}; "
+                "train one of this profile, or leave --autoencoder out"
+            )
+        self.learner.autoencoder = found
+
+    def _enter(self, name: str) -> None:
+        self.phase_name, self.step = name, 0
         self.best, self._deaf_checks = math.inf, 0
-        rate = self.config.stages[index].learning_rate
-        self.optimiser = torch.optim.Adam(self.model.parameters(), lr=rate, fused=True)
+        learner, pretraining = self.learner, isinstance(self.phase, PretrainConfig)
+        if pretraining:
+            learner.autoencoder.train().requires_grad_(True)
+        else:
+            learner.autoencoder.freeze()
+        learner.optimiser = _adam(learner.autoencoder if pretraining else learner.generator)
 
-    def draw_codes(self, batch: Batch) -> Tensor:
-        """(R, B*V, code_dim): every image and slot gets its own."""
-        images = batch.images.shape[0] * batch.images.shape[1]
-        return torch.randn(self.stage.codes, images, self.model.code_dim, generator=self._codes)
+    def advance(self) -> dict[str, Tensor]:
+        """Draws a batch and makes one step of the current phase; returns scalars for the log."""
+        phase, laps = self.phase, self.laps
+        if isinstance(phase, PretrainConfig):
+            clouds = self._draw_clouds(phase.shapes)
+            laps.stop("data")
+            rate = phase.learning_rate_at(self.step)
+            report = autoencoder_step(self.learner.autoencoder, self.learner.optimiser, clouds, rate=rate)
+            laps.stop("network")
+        else:
+            batch, chance = self._draw(phase)
+            laps.stop("data")
+            report = training_step(
+                self.learner, batch, chance, phase, step=self.step, laps=laps, world=self._world
+            )
+        laps.end_step()
+        self.step += 1
+        self.total_steps += 1
+        return report
+
+    def schedule(self) -> dict[str, float]:
+        """What the phase's schedules said to the step that was just made."""
+        phase, step = self.phase, self.step - 1
+        weight = {"diversity_weight": phase.diversity_weight(step)} if isinstance(phase, StageConfig) else {}
+        return {"learning_rate": phase.learning_rate_at(step), **weight}
+
+    def _draw_clouds(self, shapes: int) -> Tensor:
+        return self._clouds(self._sampler.draw(shapes, 1)[0])
+
+    def _clouds(self, shapes: Tensor) -> Tensor:
+        """(B,) shape numbers -> (B, N, 3) of their ground truth, N as the predictions have if there are as many."""
+        known = self._train.points.shape[1]
+        wanted = min(known, self.learner.autoencoder.config.points)
+        return self._train.clouds(shapes, self._sampler.draw_points(len(shapes), wanted, of=known))
+
+    def _draw(self, stage: StageConfig) -> tuple[Batch, Chance]:
+        """This process's share of a batch, and the random numbers that belong to it."""
+        share = self._world.share
+        shapes, views = self._sampler.draw(stage.shapes, stage.views)
+        batch = self._train.batch(share(shapes), share(views))
+        images = stage.shapes * stage.views
+        codes = torch.randn(stage.codes, images, self.learner.generator.code_dim, generator=self._random)
+        mix = torch.empty(0)
+        if stage.gamma > 0:
+            mix = torch.rand(stage.n_critic, stage.codes, images, generator=self._random)
+            real = share(self._clouds(shapes))
+            if stage.real_pool:
+                real = torch.cat([real, share(self._draw_clouds(stage.real_pool))])
+            batch = batch._replace(real=real)
+        return batch, Chance(share(codes, 1), share(mix, -1))
+
+    def networks(self) -> dict[str, nn.Module]:
+        """What a checkpoint of the current phase holds, and what it takes from there."""
+        if isinstance(self.phase, PretrainConfig):
+            return {"autoencoder": self.learner.autoencoder}
+        return {"weights": self.learner.generator, "critic": self.learner.critic}
 
     def state(self) -> dict[str, Any]:
         """Everything but the weights that decides how training continues."""
         return {
-            "stage_index": self.stage_index,
+            "phase": self.phase_name,
             "step": self.step,
             "total_steps": self.total_steps,
             "best": self.best,
             "deaf_checks": self._deaf_checks,
-            "optimiser": self.optimiser.state_dict(),
-            "sampler": self.sampler.state(),
-            "codes": self._codes.get_state(),
+            "optimiser": self.learner.optimiser.state_dict(),
+            "critic_optimiser": self.learner.critic_optimiser.state_dict(),
+            "sampler": self._sampler.state(),
+            "random": self._random.get_state(),
             "torch": torch.get_rng_state(),
-            "fingerprint": self._fingerprint,
+            "fingerprint": self._train.fingerprint,
         }
 
-    def restore(self, state: dict[str, Any], *, where: Path) -> None:
-        """Puts back what `state` returned; `where` it was kept, for the error."""
-        if state["fingerprint"] != self._fingerprint:
+    def resume(self, run: Path, checkpoint: Path) -> None:
+        """Puts back what `networks` and `state` gave when a run's checkpoint was made."""
+        state = load_state(checkpoint)
+        if state["fingerprint"] != self._train.fingerprint:
             raise UserError(
-                f"{where} was trained on other data (their shapes or points differ); resume with those"
+                f"{checkpoint} was trained on other data (their shapes or points differ); resume with those"
             )
-        self.begin_stage(state["stage_index"], None)
+        self._enter(state["phase"])
+        if not isinstance(self.phase, PretrainConfig) and self.config.needs_autoencoder:
+            self._take_autoencoder(run)
+        load_networks(checkpoint, self.networks())
         self.step, self.total_steps = state["step"], state["total_steps"]
         self.best, self._deaf_checks = state["best"], state["deaf_checks"]
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.sampler.restore(state["sampler"])
-        self._codes.set_state(state["codes"])
+        self.learner.optimiser.load_state_dict(state["optimiser"])
+        self.learner.critic_optimiser.load_state_dict(state["critic_optimiser"])
+        self._sampler.restore(state["sampler"])
+        self._random.set_state(state["random"])
         torch.set_rng_state(state["torch"])
 
     def check_health(self, images: Tensor) -> dict[str, float]:
         """Measures what image and code do; ends a run whose image has stopped to matter."""
-        found = sensitivity(self.model, images, seed=self.config.seed)
-        warm = self.stage_index > 0 or self.step >= self.config.health_patience
+        if isinstance(self.phase, PretrainConfig):
+            return {}
+        found = sensitivity(self.learner.generator, images, seed=self.config.seed)
+        warm = self.phase_name != "stage1" or self.step >= self.config.health_patience
         deaf = warm and found.image < self.config.min_image_sensitivity
         self._deaf_checks = self._deaf_checks + 1 if deaf else 0
         if self._deaf_checks >= _DEAF_CHECKS:
@@ -101,11 +210,29 @@ class Training:
             "dead_share": found.dead_share,
         }
 
-    def validate_and_keep_best(self, val: LoadedSplit, out: Path) -> dict[str, float]:
-        """Validates, and writes the weights if they are the stage's best so far."""
-        figures = validate(self.model, val, seed=self.config.seed)
-        figure = figures[f"val_{self.stage.select}"]
-        if figure < self.best:
-            self.best = figure
-            save_weights(self.model, best_weights(out, self.stage_index + 1))
+    def validate_and_keep_best(self, val: LoadedSplit, run: Path) -> dict[str, float]:
+        """Validates, and writes the weights if they are the phase's best so far."""
+        phase, seed = self.phase, self.config.seed
+        if isinstance(phase, PretrainConfig):
+            network, select = self.learner.autoencoder, "val_autoencoder_cd"
+            figures = validate_autoencoder(network, val, seed=seed)
+        else:
+            network, select = self.learner.generator, f"val_{phase.select}"
+            figures = validate(network, val, seed=seed, world=self._world)
+        if figures[select] < self.best:
+            self.best = figures[select]
+            if self._world.writes:
+                save_weights(network, best_weights(run, self.phase_name))
         return figures
+
+
+def size_of(config: FitConfig) -> GeneratorConfig:
+    """The generator that a configuration trains."""
+    return dataclasses.replace(
+        SIZES[config.profile], deterministic=config.deterministic, ending=config.ending
+    )
+
+
+def _adam(network: nn.Module) -> torch.optim.Adam:
+    """Its step size is set at every step."""
+    return torch.optim.Adam(trainable(network), fused=True)

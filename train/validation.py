@@ -4,26 +4,27 @@ from __future__ import annotations
 
 import torch
 
-from models import Generator
+from models import Autoencoder, Generator
 from train.batches import LoadedSplit
 from train.metrics import cloud_errors, thin_out
+from train.parallel import ALONE, World
 
 _SHAPES_AT_ONCE = 8
 
 
 @torch.no_grad()
-def validate(model: Generator, split: LoadedSplit, *, seed: int) -> dict[str, float]:
+def validate(model: Generator, split: LoadedSplit, *, seed: int, world: World = ALONE) -> dict[str, float]:
     """Mean errors x100 over a split: one view (`val_cd_1`), all views joined (`val_cd`), and thinned
     (`val_fps_cd`).
 
-    The codes are the same at every call, so that two checkpoints differ by their weights alone.
+    The codes are the same at every call, so that two checkpoints differ by their weights alone. A group of processes
+    shares the shapes.
     """
     codes = torch.randn(
         1, len(split), split.views, model.code_dim, generator=torch.Generator().manual_seed(seed)
     )
     sums = torch.zeros(3)
-    for start in range(0, len(split), _SHAPES_AT_ONCE):
-        shapes = torch.arange(start, min(start + _SHAPES_AT_ONCE, len(split)))
+    for shapes in torch.arange(world.rank, len(split), world.size).split(_SHAPES_AT_ONCE):
         views = torch.arange(split.views).expand(len(shapes), -1)
         images = split.float_images(shapes, views).flatten(0, 1)
         clouds = model(images, codes[:, shapes].flatten(1, 2))[0].unflatten(0, views.shape)
@@ -35,5 +36,20 @@ def validate(model: Generator, split: LoadedSplit, *, seed: int) -> dict[str, fl
                 cloud_errors(thin_out(joined, model.points), truth).cd.sum(),
             ]
         )
-    means = (sums / len(split)).tolist()
+    means = (world.sum(sums) / len(split)).tolist()
     return dict(zip(("val_cd_1", "val_cd", "val_fps_cd"), means, strict=True))
+
+
+@torch.no_grad()
+def validate_autoencoder(model: Autoencoder, split: LoadedSplit, *, seed: int) -> dict[str, float]:
+    """Mean chamfer distance x100 between clouds of the split and what the auto-encoder makes of them.
+
+    It reads as many points as it writes, the same at every call, and is measured against all.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    some = torch.randperm(split.points.shape[1], generator=generator)[: model.config.points]
+    training = model.training
+    model.eval()
+    errors = [cloud_errors(model(truth[:, some]), truth).cd for truth in split.points.split(_SHAPES_AT_ONCE)]
+    model.train(training)
+    return {"val_autoencoder_cd": torch.cat(errors).mean().item()}

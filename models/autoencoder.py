@@ -1,0 +1,134 @@
+"""The auto-encoder of point clouds: its code space is where the critic compares predictions with real shapes.
+
+The encoder sees every point alone and keeps, for each of the code's numbers, the largest answer of any point:
+a code describes a set, whatever the order and number of its points.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import torch
+from torch import Tensor, nn
+
+LATENT_DIM = 128
+_HIDDEN = 256
+
+
+@dataclasses.dataclass(frozen=True)
+class AutoencoderConfig:
+    """Everything that fixes the network's shape.
+
+    Attributes:
+        profile: name of the size, for the record.
+        points: points per decoded cloud; that of the profile's generator.
+        width: factor on the encoder's hidden channels; 1 is the paper's.
+    """
+
+    profile: str = "cpu"
+    points: int = 512
+    width: float = 0.5
+
+
+AUTOENCODER_PROFILES = {
+    "full": AutoencoderConfig("full", 2048, 1.0),
+    "cpu": AutoencoderConfig("cpu", 512, 0.5),
+    "smoke": AutoencoderConfig("smoke", 128, 0.25),
+}
+
+
+def build_autoencoder(profile: str = "cpu", *, config: AutoencoderConfig | None = None) -> Autoencoder:
+    """Builds an auto-encoder with freshly drawn weights (seed torch for reproducible ones).
+
+    Args:
+        profile: "full" (2048 points), "cpu" (512) or "smoke" (128).
+        config: sizes of your own; `profile` is then ignored.
+
+    Example:
+        >>> model = build_autoencoder("smoke")
+        >>> model(torch.rand(2, 300, 3)).shape
+        torch.Size([2, 128, 3])
+    """
+    if config is None:
+        if profile not in AUTOENCODER_PROFILES:
+            raise ValueError(
+                f"build_autoencoder: 'profile' must be one of {', '.join(AUTOENCODER_PROFILES)}; got {profile!r}"
+            )
+        config = AUTOENCODER_PROFILES[profile]
+    return Autoencoder(config)
+
+
+class Autoencoder(nn.Module):
+    """(B, P, 3) points -> (B, LATENT_DIM) codes -> (B, N, 3) points, all in the world frame."""
+
+    def __init__(self, config: AutoencoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        hidden = (max(4, round(channels * config.width)) for channels in (64, 128, 256, 256))
+        self.each_point = _each_point(3, *hidden, LATENT_DIM)
+        self.decode = ShapeDecoder(config.points)
+        for module in self.each_point:
+            if isinstance(module, nn.Linear):
+                _xavier(module)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Writes a cloud down as a code and reads it again: (B, P, 3) -> (B, N, 3)."""
+        return self.decode(self.encode(points))
+
+    def encode(self, points: Tensor) -> Tensor:
+        """(B, P, 3) points, any P >= 1 -> (B, LATENT_DIM)."""
+        return self._answers(points).amax(1)
+
+    def freeze(self) -> Autoencoder:
+        """Ends its training: eval mode, with the running statistics of its batch norms, and no gradients."""
+        return self.eval().requires_grad_(False)
+
+    def encode_frozen(self, points: Tensor) -> Tensor:
+        """`encode`, in less time and memory: only points that set a number of the code get a gradient anyway.
+
+        They are found without a graph; then they alone pass once more. Requires eval mode (with batch
+        statistics, all points would take part).
+        """
+        if self.training:
+            raise RuntimeError(
+                "Autoencoder: encode_frozen is for a network in eval mode; call freeze() first"
+            )
+        with torch.no_grad():
+            deciding = self._answers(points).argmax(1)  # (B, LATENT_DIM): for each number, its point
+        chosen = torch.take_along_dim(points, deciding[..., None], 1)
+        return self._answers(chosen).diagonal(dim1=1, dim2=2)
+
+    def _answers(self, points: Tensor) -> Tensor:
+        """(B, P, 3) -> (B, P, LATENT_DIM): what each point says to each number of the code."""
+        return self.each_point(points.reshape(-1, 3)).unflatten(0, points.shape[:2])
+
+
+class ShapeDecoder(nn.Sequential):
+    """(B, LATENT_DIM) codes -> (B, N, 3) points: three fully connected layers."""
+
+    def __init__(self, points: int) -> None:
+        super().__init__(
+            nn.Linear(LATENT_DIM, _HIDDEN),
+            nn.ReLU(),
+            nn.Linear(_HIDDEN, _HIDDEN),
+            nn.ReLU(),
+            nn.Linear(_HIDDEN, 3 * points),
+            nn.Unflatten(1, (points, 3)),
+        )
+        for module in self:
+            if isinstance(module, nn.Linear):
+                _xavier(module)
+
+
+def _each_point(*widths: int) -> nn.Sequential:
+    """Linear + batch norm + ReLU, the same for every point: a convolution of kernel size 1."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in itertools.pairwise(widths):
+        layers += [nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+def _xavier(layer: nn.Linear) -> None:
+    nn.init.xavier_uniform_(layer.weight)
+    nn.init.zeros_(layer.bias)

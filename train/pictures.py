@@ -1,0 +1,45 @@
+"""Pictures of what a generator in training makes of shapes that it does not train on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from models import Generator
+from train.batches import LoadedSplit
+
+_SHAPES = 3
+_CODES = 3
+_PIXELS = 128
+
+
+@torch.no_grad()
+def draw_predictions(model: Generator, val: LoadedSplit, path: Path, *, seed: int) -> None:
+    """Draws a few shapes of a split: predictions of one image and several codes, all views joined, and the truth.
+
+    The shapes and codes are the same at every call with the same seed.
+    """
+    from train import figures  # matplotlib takes a second to import
+
+    generator = torch.Generator().manual_seed(seed)
+    examples = []
+    for shape in torch.linspace(0, len(val) - 1, min(_SHAPES, len(val))).long():
+        views = torch.arange(val.views)
+        batch = val.batch(shape[None], views[None])
+        codes = torch.randn(_CODES, val.views, model.code_dim, generator=generator)
+        clouds = model(batch.images[0], codes)
+        truth = val.points[shape]
+        images, camera = figures.close_up(
+            _square(batch.images[0]), batch.camera[0].resize(_PIXELS, _PIXELS), truth
+        )
+        joined = clouds[0].flatten(0, 1)
+        examples.append(figures.Example(images, camera, 0, clouds[:, 0], joined, truth))
+    figures.save(figures.overview_figure(examples), path)
+
+
+def _square(images: Tensor) -> Tensor:
+    """(V, 3, h, w) of the network's input, which is stretched -> (V, 3, _PIXELS, _PIXELS)."""
+    return F.interpolate(images, size=(_PIXELS, _PIXELS), mode="bilinear", align_corners=False)
