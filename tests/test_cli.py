@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
 from train.__main__ import main
 from train.config import fit_config_from_json
-from train.images import read_images
+from train.errors import UserError
+from train.images import on_dark, read_images
+from train.runs import open_run
 
 
 @pytest.fixture
@@ -52,6 +56,12 @@ def picture(tmp_path: Path) -> Path:
         ("reconstruct {run} {tmp}/empty --out {tmp}/out", "empty"),
         ("reconstruct {run} --out {tmp}/out", "1 to 24 images; got 0"),
         ("reconstruct {run} {tmp}/picture.png --out {tmp}/noise.png", "noise.png is a file"),
+        ("reconstruct {run} {tmp}/picture.png --out {tmp}/out --groups 0", "--groups must be at least 1"),
+        ("evaluate {run} --data {data} --views 0,2 --out {tmp}/out", "none below 1; got [0, 2]"),
+        ("evaluate {run} --data {data} --seeds --out {tmp}/out", "--seeds needs at least one number"),
+        ("evaluate {run} --data {data} --limit 0 --out {tmp}/out", "--limit must be at least 1"),
+        ("experiment agreement --run {tmp}/empty --data {data} --out {tmp}/out", "is not a run"),
+        ("experiment agreement --run {run} --data {data} --out {tmp}/out --views 9", "between 2 and the 4"),
     ],
 )
 def test_a_users_mistake_is_one_line_and_exit_code_2(
@@ -97,9 +107,11 @@ def test_fit_and_evaluate_from_the_command_line(
     assert main(["fit", "--data", str(tiny_data), "--out", str(run), "--resume"]) == 0
     assert main(["fit", "--data", str(tiny_data), "--out", str(run), "--resume", "--seed", "8"]) == 2
     capsys.readouterr()
-    assert main(["evaluate", str(run), "--data", str(tiny_data), "--seeds", "0", "--views", "1", "2"]) == 0
-    assert "medoid of train" in capsys.readouterr().out
-    assert list(json.loads((run / "evaluation.json").read_text())["views"]) == ["1", "2"]
+    for views in (["1", "2"], ["1,2"]):
+        assert main(["evaluate", str(run), "--data", str(tiny_data), "--seeds", "0", "--views", *views]) == 0
+        assert "medoid of train" in capsys.readouterr().out
+        assert list(json.loads((run / "evaluation.json").read_text())["views"]) == ["1", "2"]
+        (run / "evaluation.json").unlink()
 
 
 def test_reconstruct_writes_a_cloud_and_a_page(smoke_run: Path, picture: Path, tmp_path: Path) -> None:
@@ -115,7 +127,52 @@ def test_reconstruct_writes_a_cloud_and_a_page(smoke_run: Path, picture: Path, t
     assert np.abs(cloud.vertices).max() < 2
 
 
-@pytest.mark.parametrize("command", ["", "data", "data procedural", "fit", "reconstruct", "evaluate", "demo"])
+@pytest.fixture
+def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the weights that come with the repository are looked for; nothing is there yet."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("train.runs._SHIPPED", tmp_path / "shipped")
+    return tmp_path / "shipped" / "generator.safetensors"
+
+
+def test_the_word_pretrained_says_what_is_missing(
+    shipped: Path, picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["reconstruct", "pretrained", str(picture), "--out", str(tmp_path / "out")]) == 2
+    complaint = capsys.readouterr().err
+    assert str(shipped) in complaint
+    assert "python -m train fit" in complaint
+    assert complaint.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_word_pretrained_names_the_shipped_weights(
+    shipped: Path, smoke_run: Path, tiny_data: Path, picture: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    shipped.parent.mkdir()
+    shutil.copy(smoke_run / "checkpoints" / "best-stage2.safetensors", shipped)
+    command = ["reconstruct", "pretrained", str(picture), str(picture), "--steps", "1"]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "reconstruction.ply").exists()
+    evaluate = ["evaluate", "pretrained", "--data", str(tiny_data), "--views", "1", "--seeds", "0"]
+    assert main(evaluate) == 2
+    assert "say where to write with --out" in capsys.readouterr().err
+    assert main([*evaluate, "--out", str(tmp_path / "scores.json")]) == 0
+    assert json.loads((tmp_path / "scores.json").read_text())["profile"] == "smoke"
+    assert [path.name for path in shipped.parent.iterdir()] == [shipped.name]
+
+
+def test_a_directory_of_that_name_goes_first(shipped: Path, picture: Path, tmp_path: Path) -> None:
+    (tmp_path / "pretrained").mkdir()
+    with pytest.raises(UserError, match="pretrained is not a run"):
+        open_run(Path("pretrained"))
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["", "data", "data procedural", "fit", "reconstruct", "evaluate", "experiment", "demo"],
+)
 def test_help_is_there_without_loading_torch(command: str) -> None:
     code = "import sys; from train.__main__ import main\n"
     code += "try: main(sys.argv[1:])\nexcept SystemExit as e: code = e.code\n"
@@ -143,27 +200,71 @@ def test_idle_threads_are_told_to_sleep_before_torch_starts() -> None:
     assert done.stdout.split() == ["passive", "False"]
 
 
-@pytest.mark.parametrize("mode", ["L", "LA", "P", "RGB", "RGBA", "I;16"])
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "I;16", "I", "F"])
 def test_pictures_of_every_kind_become_rgb_on_white(mode: str, tmp_path: Path) -> None:
     pixels = np.full((30, 50, 4), 255, np.uint8)
     pixels[..., 3] = 0
     pixels[10:20, 20:30] = (0, 0, 0, 255)
     image = Image.fromarray(pixels, "RGBA")
-    if mode == "I;16":
-        grey = np.where(pixels[..., 3] == 255, 0, 65535).astype(np.uint16)
-        image = Image.fromarray(grey)
-    elif mode in ("RGB", "L", "P"):
+    if mode in ("I;16", "I", "F"):
+        white, kind = {"I;16": (65535, np.uint16), "I": (65535, np.int32), "F": (1, np.float32)}[mode]
+        image = Image.fromarray(np.where(pixels[..., 3] == 255, 0, white).astype(kind))
+    elif mode == "PA":  # a palette whose transparent entry shows through: what GIFs and many icons are
+        image = image.quantize(colors=4)
+    elif mode in ("RGB", "L", "P", "1", "CMYK"):
         white = Image.new("RGBA", image.size, "white")
         white.alpha_composite(image)
         image = white.convert(mode)
     else:
         image = image.convert(mode)
-    image.save(tmp_path / "picture.png")
-    result = read_images([tmp_path / "picture.png"], size=50)
+    path = tmp_path / ("picture.tif" if mode in ("CMYK", "I", "F") else "picture.png")
+    image.save(path)
+    with Image.open(path) as saved:
+        assert saved.mode == {"PA": "P"}.get(mode, mode)
+    result = read_images([path], size=50)
     assert result.shape == (1, 3, 50, 50)
     assert result[0, :, 20:30, 20:30].max() < 0.02  # the black square, centred after padding 10 rows above
     assert result[0, :, :20].min() > 0.98
     assert result[0, :, 30:].min() > 0.98
+
+
+def test_a_picture_too_small_or_cut_short_is_refused_by_name(picture: Path, tmp_path: Path) -> None:
+    Image.new("RGB", (200, 15), "red").save(tmp_path / "strip.png")
+    with pytest.raises(UserError, match=r"strip\.png is 200 x 15 pixels; at least 16 x 16"):
+        read_images([picture, tmp_path / "strip.png"])
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    for name in ("half.png", "half.jpg"):
+        Image.fromarray(noise).save(tmp_path / name)
+        whole = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(UserError, match=rf"{name} is not an image that can be read \(.+\)$"):
+            read_images([tmp_path / name])
+    Image.new("RGBA", (40, 40), (200, 0, 0, 0)).save(tmp_path / "clear.png")
+    with pytest.raises(UserError, match=r"clear\.png shows nothing"):
+        read_images([picture, tmp_path / "clear.png"])
+    (tmp_path / "empty.png").touch()
+    with pytest.raises(UserError, match=r"empty\.png is not an image"):
+        read_images([tmp_path / "empty.png"])
+    Image.fromarray(np.full((20, 20), np.nan, np.float32)).save(tmp_path / "nan.tif")
+    with pytest.raises(UserError, match=r"nan\.tif .*not finite"):
+        read_images([tmp_path / "nan.tif"])
+
+
+def test_a_background_that_was_not_removed_is_pointed_out(
+    smoke_run: Path, picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.new("RGB", (60, 40), (120, 140, 90)).save(tmp_path / "lawn.png")
+    pictures = [str(picture), str(tmp_path / "lawn.png")]
+    assert (
+        main(["reconstruct", str(smoke_run), *pictures, "--out", str(tmp_path / "out"), "--steps", "0"]) == 0
+    )
+    note = capsys.readouterr().err
+    assert "lawn.png" in note
+    assert "picture.png" not in note
+    # The object may touch one side of its frame.
+    standing = torch.ones(1, 3, 32, 32)
+    standing[..., 10:, 4:28] = 0.2
+    assert on_dark(standing) == []
 
 
 def test_photographs_are_turned_as_the_camera_was_held(tmp_path: Path) -> None:

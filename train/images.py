@@ -15,6 +15,7 @@ from train.errors import UserError
 
 _SMALLEST = 16
 _WHITE_ENOUGH = 0.85
+_BLANK = 0.97
 
 
 def read_images(paths: Sequence[Path], *, size: int = 224) -> Tensor:
@@ -28,7 +29,7 @@ def read_images(paths: Sequence[Path], *, size: int = 224) -> Tensor:
         (V, 3, size, size) float32 in [0, 1].
 
     Raises:
-        UserError: a file is missing, is no image, or is too small to show anything.
+        UserError: a file is missing, is no image, or shows nothing.
     """
     squares = [_square(_read(path)) for path in paths]
     return torch.cat(
@@ -58,7 +59,10 @@ def _read(path: Path) -> Tensor:
         raise UserError(
             f"{path} is {width} x {height} pixels; at least {_SMALLEST} x {_SMALLEST} are needed to show an object"
         )
-    return on_white(pixels)
+    picture = on_white(pixels)
+    if picture.min() > _BLANK:
+        raise UserError(f"{path} shows nothing: it is white or transparent everywhere")
+    return picture
 
 
 def _pixels(image: Image.Image) -> np.ndarray:
