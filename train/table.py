@@ -26,15 +26,15 @@ def format_table(result: Mapping[str, Any]) -> str:
         f"{data['shapes']} shapes of the {data['split']} split, profile {result['profile']}, "
         f"{seeds} seed{'s' if seeds > 1 else ''}; un-squared distances x100; FPS: thinned to one prediction's size"
     )
-    rows: list[tuple[str, Mapping[str, Any]]] = [("", _COLUMNS)]
+    lines = [head, _line("", _COLUMNS)]
     for n, scores in result["views"].items():
-        rows.append((_views(n), scores))
+        lines.append(_line(_views(n), scores))
         if seeds > 1:
-            rows.append(("  sd over seeds", result["spread"][n]))
-    rows += [(f"{_views(n)}, random codes", row) for n, row in result["random_codes"].items() if n != "1"]
+            lines.append(_line("  sd over seeds", result["spread"][n], digits=3))
+    rows = [(f"{_views(n)}, random codes", row) for n, row in result["random_codes"].items() if n != "1"]
     rows += [("medoid of train", result["medoid"])]
     rows += [(f"nearest image, {_views(n)}", scores) for n, scores in result["nearest_image"].items()]
-    lines = [head, *(_line(name, scores) for name, scores in rows)]
+    lines += [_line(name, scores) for name, scores in rows]
     if len(result["categories"]) > 1:
         lines += ["", *_by_category(result)]
     return "\n".join([*lines, "", *_remarks(result)])
@@ -73,13 +73,13 @@ def _views(n: str) -> str:
     return f"{n} view" if n == "1" else f"{n} views"
 
 
-def _line(name: str, cells: Mapping[str, Any]) -> str:
+def _line(name: str, cells: Mapping[str, Any], *, digits: int = 2) -> str:
     def show(column: str) -> str:
         cell = cells.get(column)
         if cell is None:
             return "-"
         if isinstance(cell, str):
             return cell
-        return f"{cell:.3f}" if column == "fscore_01" or cell < 0.1 else f"{cell:.2f}"
+        return f"{cell:.{3 if column == 'fscore_01' else digits}f}"
 
     return f"{name:{_NAME_WIDTH}}" + "".join(f"{show(column):>10}" for column in _COLUMNS)
