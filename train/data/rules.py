@@ -1,0 +1,104 @@
+"""Do the rules of ambiguity hold? The accepted objects of each family, measured again on other terms."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from train.data.families import AMBIGUOUS, FAMILIES
+from train.data.procedural import Ambiguity, ambiguity, variants_of
+from train.data.render import load_embree
+from train.data.work import run_all
+from train.errors import UserError
+
+# Not the acceptance's own terms: finer pictures, views between its views, other samples.
+_TERMS = {"size": 160, "fronts": 5, "sampling": 1}
+
+
+@dataclasses.dataclass(frozen=True)
+class RulesReport:
+    """The figures of every object, by family."""
+
+    figures: dict[str, dict[int, Ambiguity]]
+    failures: dict[str, str]
+
+    @property
+    def broken(self) -> list[str]:
+        """The objects that break a rule, and those that could not be made."""
+        worse = [
+            f"{category} {seed}: front {each.front:.2%}, back {each.back:.0%}, separation {each.separation:.2f}"
+            for category, figures in self.figures.items()
+            for seed, each in figures.items()
+            if not each.holds
+        ]
+        return worse + list(self.failures.values())
+
+    def summary(self) -> str:
+        """A table for the terminal: medians and the worst case of each family."""
+        lines = [
+            "pixels that differ between the backs of one object, chamfer over the noise of sampling: median (worst)",
+            f"{'family':<12}{'objects':>8}{'front < 1 %':>20}{'back > 10 %':>18}{'separation > 2':>18}",
+        ]
+        for category, figures in self.figures.items():
+            front, back, separation = (
+                np.array([getattr(each, name) for each in figures.values()])
+                for name in ("front", "back", "separation")
+            )
+            lines.append(
+                f"{category:<12}{len(figures):>8}{f'{np.median(front):.2%} ({front.max():.2%})':>20}"
+                f"{f'{np.median(back):.0%} ({back.min():.0%})':>18}"
+                f"{f'{np.median(separation):.2f} ({separation.min():.2f})':>18}"
+            )
+        if self.broken:
+            lines += [f"{len(self.broken)} objects break a rule:", *(f"  {line}" for line in self.broken)]
+        else:
+            lines.append("all rules hold")
+        return "\n".join(lines)
+
+
+def measure(
+    categories: Sequence[str] | None = None, *, objects: int = 20, seed: int = 0, processes: int | None = None
+) -> RulesReport:
+    """Measure rules 3 and 4 on accepted objects.
+
+    Args:
+        categories: families with designed ambiguity; None for all of them.
+        objects: how many of each family.
+        seed: of the first object; the others follow.
+        processes: None for one per core.
+
+    Raises:
+        UserError: a family that is unknown or hides nothing by design, or no objects.
+    """
+    names = AMBIGUOUS if categories is None else tuple(dict.fromkeys(categories))
+    strange = [name for name in names if name not in AMBIGUOUS]
+    if strange:
+        raise UserError(
+            f"no family with designed ambiguity is called {', '.join(strange)}; there are: {', '.join(AMBIGUOUS)}"
+        )
+    if objects < 1 or seed < 0:
+        raise UserError(f"objects must be at least 1 and seed not negative; got {objects} and {seed}")
+    load_embree()
+    jobs = [(name, number) for name in names for number in range(seed, seed + objects)]
+    figures: dict[str, dict[int, Ambiguity]] = {name: {} for name in names}
+    failures = {}
+    for (name, number), result in run_all(
+        _figure, jobs, processes=processes, desc="measuring", unit="object"
+    ):
+        if isinstance(result, Exception):
+            failures[f"{name} {number}"] = f"{name} {number}: {result}"
+        else:
+            figures[name][number] = result
+    return RulesReport(figures, failures)
+
+
+def _figure(job: tuple[str, int]) -> Ambiguity | Exception:
+    category, seed = job
+    cone = FAMILIES[category].cone
+    assert cone is not None
+    try:
+        return ambiguity(variants_of(category, seed), cone, **_TERMS)
+    except (RuntimeError, OSError) as error:
+        return error
