@@ -17,22 +17,23 @@ def fail(function: str, argument: str, expected: str, got: str, hint: str = "") 
 
 
 def check_tensor(function: str, name: str, value: Any, shape: tuple[int | str, ...]) -> Tensor:
-    """Type, device, dtype and shape of a float tensor. A string in `shape` is a free size; "*" any leading sizes."""
+    """Type, dtype and shape of a float tensor. A string in `shape` is a free size; "*" any leading sizes."""
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{function}: '{name}' must be a torch.Tensor; got {type(value).__name__}.")
     if value.dtype not in FLOATS:
         raise TypeError(
             f"{function}: '{name}' must be float32 or float64; got {value.dtype}. Convert it with .float()."
         )
-    check_device(function, name, value)
     check_shape(function, name, value, shape)
     return value
 
 
-def check_device(function: str, name: str, value: Tensor) -> None:
-    if value.device.type not in ("cpu", "meta"):
+def check_device(function: str, name: str, value: Tensor, like: Tensor) -> None:
+    """The tensors of a call live on one device. Which one is free: the ops move theirs to the CPU and back."""
+    if value.device != like.device:
         raise ValueError(
-            f"{function}: '{name}' must be on the CPU; got device {value.device}. Move it with .cpu()."
+            f"{function}: '{name}' must be on the device of the other arguments ({like.device}); "
+            f"got {value.device}. Move it with .to({str(like.device)!r})."
         )
 
 
@@ -50,26 +51,28 @@ def check_shape(
 
 
 def check_same_dtype(function: str, **tensors: Tensor) -> torch.dtype:
-    """All of them share one dtype."""
+    """All of them share one dtype, and one device."""
     (first_name, first), *rest = tensors.items()
     for name, value in rest:
         if value.dtype != first.dtype:
             raise TypeError(
                 f"{function}: '{name}' must have the dtype of '{first_name}' ({first.dtype}); got {value.dtype}."
             )
+        check_device(function, name, value, first)
     return first.dtype
 
 
 def check_lengths(
-    function: str, name: str, lengths: Any, shape: tuple[int, ...], largest: int
+    function: str, name: str, lengths: Any, shape: tuple[int, ...], largest: int, like: Tensor | None = None
 ) -> Tensor | None:
-    """Lengths are integers of shape `shape` in [0, largest]; None means that every set is full."""
+    """Lengths are integers of shape `shape` in [0, largest], beside `like`; None means that every set is full."""
     if lengths is None:
         return None
     if not isinstance(lengths, torch.Tensor) or lengths.dtype not in (torch.int64, torch.int32):
         what = lengths.dtype if isinstance(lengths, torch.Tensor) else type(lengths).__name__
         raise TypeError(f"{function}: '{name}' must be an integer tensor (int64); got {what}.")
-    check_device(function, name, lengths)
+    if like is not None:
+        check_device(function, name, lengths, like)
     if tuple(lengths.shape) != tuple(shape):
         raise fail(function, name, f"have shape {tuple(shape)}", str(tuple(lengths.shape)))
     return lengths.to(torch.int64)
@@ -93,7 +96,7 @@ def check_finite(function: str, name: str, value: Tensor, lengths: Tensor | None
         return
     bad = ~torch.isfinite(value)
     if lengths is not None:
-        bad &= (torch.arange(value.shape[-2]) < lengths[..., None])[..., None]
+        bad &= (torch.arange(value.shape[-2], device=value.device) < lengths[..., None])[..., None]
     if bool(bad.any()):
         where = tuple(bad.nonzero()[0].tolist())
         raise fail(

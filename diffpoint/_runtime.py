@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+from diffpoint._launch import FastCall
+
 # Taichi runs a parallel loop of up to 512 iterations on one thread unless it was started with other settings.
 # In a host program's Taichi every loop is therefore stretched by this factor, and acts once per stretch.
 _HOST_SPREAD = 512
@@ -42,6 +44,7 @@ class _Runtime:
         self.program: Any = None
         self.forked = False
         self.kernels: dict[tuple[str, str], SimpleNamespace] = {}
+        self.calls: dict[tuple[str, str, str], FastCall] = {}
 
     def backend(self) -> ModuleType:
         name = os.environ.get("DIFFPOINT_BACKEND", "")
@@ -92,6 +95,13 @@ class _Runtime:
                 getattr(ti, real)
             )
         return self.kernels[key]
+
+    def call(self, module: str, kernel: str, real: str) -> FastCall:
+        """One of these kernels, to be called without Taichi's overhead."""
+        key = (module, kernel, real)
+        if key not in self.calls:
+            self.calls[key] = FastCall(getattr(self.kernel(module, real), kernel))
+        return self.calls[key]
 
 
 def _installed_backend() -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import torch
@@ -68,20 +69,14 @@ class PinholeCamera:
 
     def _check_last_rows(self) -> None:
         for name, value in (("K", self.K), ("cam_from_world", self.cam_from_world)):
-            _checks.check_finite("PinholeCamera", name, value.detach())
-            row = value.detach()[..., -1, :]
-            wanted = torch.zeros_like(row)
-            wanted[..., -1] = 1
-            if not torch.allclose(row, wanted, atol=1e-5):
+            value = value.detach()
+            _checks.check_finite("PinholeCamera", name, value)
+            row = value[..., -1, :]
+            wanted = _last_row(row.shape[-1], value.dtype, value.device)
+            if row.numel() and not bool((row - wanted).abs().max() <= 1e-5):
                 got = row.reshape(-1, row.shape[-1])[0].tolist()
                 hint = "Divide the matrix by its last entry, or transpose it." if got[-1] else ""
-                raise _checks.fail(
-                    "PinholeCamera",
-                    name,
-                    f"end in the row {wanted.reshape(-1, row.shape[-1])[0].tolist()}",
-                    str(got),
-                    hint,
-                )
+                raise _checks.fail("PinholeCamera", name, f"end in the row {wanted.tolist()}", str(got), hint)
 
     @classmethod
     def look_at(
@@ -118,13 +113,13 @@ class PinholeCamera:
         right = right / right.norm(dim=-1, keepdim=True)
         down = torch.linalg.cross(forward, right)
         rotation = torch.stack((right, down, forward), dim=-2)
-        cam_from_world = torch.zeros((*at.shape[:-1], 4, 4), dtype=at.dtype)
+        cam_from_world = at.new_zeros((*at.shape[:-1], 4, 4))
         cam_from_world[..., :3, :3] = rotation
         cam_from_world[..., :3, 3] = -(rotation @ at[..., None])[..., 0]
         cam_from_world[..., 3, 3] = 1
-        K = torch.tensor(
-            [[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]], dtype=at.dtype
-        ).expand(*at.shape[:-1], 3, 3)
+        K = at.new_tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]]).expand(
+            *at.shape[:-1], 3, 3
+        )
         return cls(K, cam_from_world, height, width)
 
     @classmethod
@@ -149,7 +144,7 @@ class PinholeCamera:
             >>> PinholeCamera.from_pytorch3d(R, T, K, 4, 4).position.tolist()
             [0.0, 0.0, -2.0]
         """
-        view_from_world = torch.zeros((*R.shape[:-2], 4, 4), dtype=R.dtype)
+        view_from_world = R.new_zeros((*R.shape[:-2], 4, 4))
         view_from_world[..., :3, :3] = R.transpose(-1, -2)
         view_from_world[..., :3, 3] = T
         view_from_world[..., 3, 3] = 1
@@ -210,6 +205,13 @@ class PinholeCamera:
         return dataclasses.replace(self, K=whole.K[item], cam_from_world=whole.cam_from_world[item])
 
 
+@functools.cache
+def _last_row(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    row = torch.zeros(size, dtype=dtype, device=device)
+    row[-1] = 1
+    return row
+
+
 def _inverse(name: str, matrix: Tensor) -> Tensor:
     inverse, singular = torch.linalg.inv_ex(matrix)
     if not torch.compiler.is_compiling() and bool(singular.any()):
@@ -220,15 +222,32 @@ def _inverse(name: str, matrix: Tensor) -> Tensor:
 
 def _vector(name: str, value, like: Tensor | None = None) -> Tensor:
     if not isinstance(value, Tensor):
-        value = torch.tensor(value, dtype=torch.float32 if like is None else like.dtype)
+        value = torch.tensor(value, dtype=torch.float32) if like is None else like.new_tensor(value)
     value = _checks.check_tensor("PinholeCamera.look_at", name, value, ("*", 3))
-    return value if like is None else value.to(like.dtype)
+    return value if like is None else value.to(like)
+
+
+class Views(NamedTuple):
+    """A camera seen as one of batch shape (B, V). Matrices are computed before they are broadcast."""
+
+    camera: PinholeCamera
+    batch_shape: tuple[int, int]
+
+    @property
+    def projection(self) -> Tensor:
+        """(B, V, 3, 4), see `PinholeCamera.projection`."""
+        return self.camera.projection.expand(*self.batch_shape, 3, 4)
+
+    @property
+    def back_projection(self) -> Tensor:
+        """(B, V, 3, 4), see `PinholeCamera.back_projection`."""
+        return self.camera.back_projection.expand(*self.batch_shape, 3, 4)
 
 
 def check_views(
     function: str, name: str, camera: PinholeCamera, like: Tensor, *, views: int | None = None
-) -> PinholeCamera:
-    """The camera with batch shape (B, V), for B clouds or groups of maps `like`: () and (V,) are shared by all.
+) -> Views:
+    """The camera as (B, V) views, for B clouds or groups of maps `like`: () and (V,) are shared by all.
 
     With `views`, the number of depth maps of a group: it must have that many, or one for all of them.
     """
@@ -239,6 +258,7 @@ def check_views(
             f"{function}: '{name}' must have the dtype of the points ({like.dtype}); got {camera.dtype}. "
             f"Convert it with {name}.to({like.dtype})."
         )
+    _checks.check_device(function, name, camera.K, like)
     batch, shape = like.shape[0], camera.batch_shape
     if len(shape) > 2 or (len(shape) == 2 and shape[0] not in (1, batch)):
         raise _checks.fail(
@@ -251,7 +271,7 @@ def check_views(
     own = shape[-1] if shape else 1
     if views is not None and own not in (1, views):
         raise _checks.fail(function, name, f"have {views} views to match 'depth'", str(own))
-    return camera.expand(batch, own if views is None else views)
+    return Views(camera, (batch, own if views is None else views))
 
 
 class Projection(NamedTuple):

@@ -114,12 +114,12 @@ def paired_sets(
             function, "b", f"have shape {wanted}", str(tuple(b.shape)), "Did you forget to batch?"
         )
     _checks.check_same_dtype(function, a=a, b=b)
-    la = _checks.check_lengths(function, "a_lengths", a_lengths, batch, a.shape[-2])
-    lb = _checks.check_lengths(function, "b_lengths", b_lengths, batch, b.shape[-2])
+    la = _checks.check_lengths(function, "a_lengths", a_lengths, batch, a.shape[-2], a)
+    lb = _checks.check_lengths(function, "b_lengths", b_lengths, batch, b.shape[-2], b)
     count = torch.Size(batch).numel()
     a3, b3 = a.reshape(count, *a.shape[-2:]), b.reshape(count, *b.shape[-2:])
-    la = _bridge.full_lengths(la, count, a.shape[-2])
-    lb = _bridge.full_lengths(lb, count, b.shape[-2])
+    la = _bridge.full_lengths(la, count, a.shape[-2], a)
+    lb = _bridge.full_lengths(lb, count, b.shape[-2], b)
     return a3, b3, la, lb, batch
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
-from diffpoint.camera import PinholeCamera, PointSets, Projection, check_views
+from diffpoint.camera import PinholeCamera, PointSets, Projection, Views, check_views
 
 
 class Reprojection(NamedTuple):
@@ -102,7 +103,7 @@ def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Re
     pixels = pixels.reshape(batch, count, height, width, 2)
     seen_depth = seen_depth.reshape(depth.shape)
     foreground = torch.isfinite(depth)
-    u, v = pixels.unbind(-1)
+    u, v = pixels[..., 0], pixels[..., 1]
     inside = (u >= 0) & (u < target.width) & (v >= 0) & (v < target.height) & (seen_depth > 0)
     return Reprojection(
         points=points.reshape(batch, count, height, width, 3),
@@ -112,7 +113,7 @@ def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Re
     )
 
 
-def _depth_views(function: str, depth: Tensor, name: str, camera: PinholeCamera) -> PinholeCamera:
+def _depth_views(function: str, depth: Tensor, name: str, camera: PinholeCamera) -> Views:
     """The camera expanded to the (B, V) of the depth maps, of their size and dtype."""
     _checks.check_tensor(function, "depth", depth, ("B", "V", "H", "W"))
     _, count, height, width = depth.shape
@@ -143,16 +144,17 @@ def _project_gradient(ctx, grad_pixels: Tensor, grad_depth: Tensor):
 
 @_bridge.register("project", fake=_project_fake, backward=_project_gradient, setup=_project_setup)
 def _project(points: Tensor, projection: Tensor, caller: str) -> tuple[Tensor, Tensor]:
-    _checks.check_finite(caller, "points", points)
     batch, views = projection.shape[:2]
     count = points.shape[1]
     pixels = points.new_empty((batch, views, count, 2))
     depth = points.new_empty((batch, views, count))
     if depth.numel():
+        total = points.new_empty(batch * views)
         inputs = points.reshape(-1), projection.reshape(-1)
-        _bridge.launch(
-            "reproject", "project", points.dtype, *inputs, pixels.view(-1), depth.view(-1), views, count
-        )
+        outputs = pixels.view(-1), depth.view(-1), total
+        _bridge.launch("reproject", "project", points.dtype, *inputs, *outputs, views, count)
+    if depth.numel() == 0 or not math.isfinite(float(total.sum())):
+        _checks.check_finite(caller, "points", points)
     return pixels, depth
 
 
@@ -167,12 +169,13 @@ def _project_backward(
     points: Tensor, projection: Tensor, grad_pixels: Tensor, grad_depth: Tensor
 ) -> tuple[Tensor, Tensor]:
     views, count = projection.shape[1], points.shape[1]
-    grad_points = points.new_zeros(points.shape)
-    grad_projection = projection.new_zeros(projection.shape)
-    if points.numel() and projection.numel():
-        inputs = points.reshape(-1), projection.reshape(-1), grad_pixels.reshape(-1), grad_depth.reshape(-1)
-        outputs = grad_points.view(-1), grad_projection.view(-1)
-        _bridge.launch("reproject", "project_backward", points.dtype, *inputs, *outputs, views, count)
+    if points.numel() == 0 or projection.numel() == 0:
+        return points.new_zeros(points.shape), projection.new_zeros(projection.shape)
+    grad_points = points.new_empty(points.shape)
+    grad_projection = projection.new_empty(projection.shape)
+    inputs = points.reshape(-1), projection.reshape(-1), grad_pixels.reshape(-1), grad_depth.reshape(-1)
+    outputs = grad_points.view(-1), grad_projection.view(-1)
+    _bridge.launch("reproject", "project_backward", points.dtype, *inputs, *outputs, views, count)
     return grad_points, grad_projection
 
 

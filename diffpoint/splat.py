@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
+from diffpoint._runtime import runtime_info
 from diffpoint.camera import PinholeCamera, check_views
+
+_ALONE = 12_000  # points and quarters of pixels up to which waking a second thread costs more than it saves
+_PART = 16_384  # the least points of a view for which a map of their own pays
 
 
 class Splat(NamedTuple):
@@ -55,9 +60,9 @@ def splat_depth(
     if not radius >= 0 or radius == float("inf"):
         raise _checks.fail("splat_depth", "radius", "be a finite number of pixels, at least 0", repr(radius))
     batch = points.shape[0]
-    lengths = _checks.check_lengths("splat_depth", "lengths", lengths, (batch,), points.shape[1])
+    lengths = _checks.check_lengths("splat_depth", "lengths", lengths, (batch,), points.shape[1], points)
     views = check_views("splat_depth", "camera", camera, points)
-    lengths = _bridge.full_lengths(lengths, batch, points.shape[1])
+    lengths = _bridge.full_lengths(lengths, batch, points.shape[1], points)
     return Splat(*_splat(points, lengths, views.projection, camera.height, camera.width, float(radius)))
 
 
@@ -88,22 +93,40 @@ def _splat(
     points: Tensor, lengths: Tensor, projection: Tensor, height: int, width: int, radius: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     _checks.check_lengths_range("splat_depth", "lengths", lengths, points.shape[1])
-    _checks.check_finite("splat_depth", "points", points, lengths)
     batch, views = projection.shape[:2]
-    count = points.shape[1]
-    shape = (batch, views, height, width)
-    if count == 0 or batch * views == 0:
-        empty = points.new_full(shape, torch.inf), torch.full(shape, -1, dtype=torch.int64)
-        return *empty, torch.zeros((batch, views, count), dtype=torch.bool)
-    depth = points.new_empty(shape)
-    index = torch.empty(shape, dtype=torch.int64)
-    visible = torch.empty((batch, views, count), dtype=torch.uint8)
-    outputs = depth.view(-1), index.view(-1), visible.view(-1)
-    kernel, extra = ("forward", ()) if radius == 0 else ("forward_disc", (radius,))
-    sizes = views, count, height, width
-    inputs = points.reshape(-1), lengths, projection.reshape(-1)
-    _bridge.launch("splat", kernel, points.dtype, *inputs, *outputs, *sizes, *extra)
-    return depth, index, visible.view(torch.bool)
+    count, rows, pixels = points.shape[1], batch * views, height * width
+    depth = points.new_empty(rows * pixels)
+    index = torch.empty(rows * pixels, dtype=torch.int64)
+    visible = torch.empty(rows * count, dtype=torch.uint8)
+    if visible.numel() == 0:
+        _checks.check_finite("splat_depth", "points", points, lengths)
+        depth.fill_(torch.inf)
+        index.fill_(-1)
+    else:
+        parts = _parts(rows, count)
+        maps = depth, index
+        if parts > 1:
+            maps = depth.new_empty(parts * rows * pixels), index.new_empty(parts * rows * pixels)
+        total = points.new_empty(rows * parts)
+        kernel = "forward_disc" if radius > 0 else "forward"
+        if rows * (count + pixels // 4) < _ALONE:
+            kernel += "_alone"
+        inputs = points.reshape(-1), lengths, projection.reshape(-1)
+        sizes = views, parts, count, height, width, radius
+        _bridge.launch("splat", kernel, points.dtype, *inputs, *maps, visible, total, *sizes)
+        if not math.isfinite(float(total.sum())):
+            _checks.check_finite("splat_depth", "points", points, lengths)
+        if parts > 1:
+            _bridge.launch("splat", "merge", points.dtype, *maps, depth, index, visible, parts, count, pixels)
+    shape = batch, views, height, width
+    return depth.view(shape), index.view(shape), visible.view(torch.bool).view(batch, views, count)
+
+
+def _parts(rows: int, count: int) -> int:
+    """Among how many maps the points of a view are shared out, so that a few large clouds keep every thread busy."""
+    if rows > 8 or count < 2 * _PART:
+        return 1
+    return max(1, min(runtime_info().threads // rows, count // _PART))
 
 
 @_bridge.register(
@@ -117,21 +140,22 @@ def _splat_backward(
     points: Tensor, projection: Tensor, index: Tensor, grad_depth: Tensor
 ) -> tuple[Tensor, Tensor]:
     _, views, height, width = index.shape
-    grad_points = points.new_zeros(points.shape)
-    grad_projection = projection.new_zeros(projection.shape)
-    if points.numel() and index.numel():
-        _bridge.launch(
-            "splat",
-            "backward",
-            points.dtype,
-            points.reshape(-1),
-            projection.reshape(-1),
-            index.view(-1),
-            grad_depth.reshape(-1),
-            grad_points.view(-1),
-            grad_projection.view(-1),
-            views,
-            points.shape[1],
-            height * width,
-        )
+    if points.numel() == 0 or index.numel() == 0:
+        return points.new_zeros(points.shape), projection.new_zeros(projection.shape)
+    grad_points = points.new_empty(points.shape)
+    grad_projection = projection.new_empty(projection.shape)
+    _bridge.launch(
+        "splat",
+        "backward",
+        points.dtype,
+        points.reshape(-1),
+        projection.reshape(-1),
+        index.view(-1),
+        grad_depth.reshape(-1),
+        grad_points.view(-1),
+        grad_projection.view(-1),
+        views,
+        points.shape[1],
+        height * width,
+    )
     return grad_points, grad_projection

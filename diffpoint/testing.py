@@ -43,12 +43,13 @@ def tie_free_clouds(
     views = check_views(
         "tie_free_clouds", "camera", camera.to(torch.float64), torch.empty(batch, 0, 3, dtype=torch.float64)
     )
+    cameras = views.camera.expand(*views.batch_shape)
     clouds = []
     for cloud in range(batch):
         points = torch.rand(8 * count, 3, dtype=torch.float64, generator=generator) - 0.5
         points = points.to(dtype).to(torch.float64)
         for view in range(views.batch_shape[1]):
-            camera_here = views[cloud, view]
+            camera_here = cameras[cloud, view]
             points = points[~boundary_points(points[None], camera_here, margin=margin)[0, 0]]
             depth, order = (points @ camera_here.projection[2, :3]).sort()
             gap = depth.diff(prepend=depth[:1] - 1)

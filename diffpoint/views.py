@@ -56,7 +56,7 @@ def sample_view(points: Tensor, splat: Splat | Tensor) -> ViewSample:
             "sample_view: 'splat' must be the result of splat_depth, or of visible_points (a bool tensor); "
             f"got {what}."
         )
-    _checks.check_device("sample_view", "splat", visible)
+    _checks.check_device("sample_view", "splat", visible, points)
     _checks.check_shape("sample_view", "splat", visible, ("B", "V", "N"))
     batch, _, count = visible.shape
     if (batch, count) != tuple(points.shape[:2]):

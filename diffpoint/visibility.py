@@ -85,14 +85,14 @@ def visible_points(
         if value is not None and not 0 <= value < math.inf:
             raise _checks.fail("visible_points", name, "be a finite number, at least 0", repr(value))
     batch, count = points.shape[:2]
-    lengths = _checks.check_lengths("visible_points", "lengths", lengths, (batch,), count)
+    lengths = _checks.check_lengths("visible_points", "lengths", lengths, (batch,), count, points)
     views = check_views("visible_points", "camera", camera, points)
     if method == "zbuffer":
         return splat_depth(points.detach(), camera, lengths=lengths).visible
     own_radius, own_tolerance = _DEFAULTS[method]
     return _visible(
         points.detach(),
-        _bridge.full_lengths(lengths, batch, count),
+        _bridge.full_lengths(lengths, batch, count, points),
         views.projection.detach(),
         camera.height,
         camera.width,

@@ -173,8 +173,3 @@ def test_options_out_of_range():
     ):
         with pytest.raises(ValueError, match=message):
             call()
-
-
-def test_tensors_elsewhere():
-    with pytest.raises(ValueError, match=r"must have shape|must be on the CPU"):
-        dp.nearest(torch.rand(2, 5, 3), torch.rand(2, 5, 2, device="meta"))

@@ -1,4 +1,4 @@
-"""The ops as torch operators: registered, traceable, and refusing a second derivative by name."""
+"""The ops as torch operators: registered, traceable, on any device, and refusing a second derivative by name."""
 
 import pytest
 import torch
@@ -82,3 +82,65 @@ def test_the_layer_compiles_into_one_graph_and_exports():
 
     exported = torch.export.export(Layer(), (points.detach(), truth)).module()
     assert torch.allclose(exported(points.detach(), truth), plain)
+
+
+@pytest.fixture(scope="module")
+def elsewhere() -> str:
+    """A device whose tensors are not in the CPU's memory: torch's lazy device, which needs no accelerator."""
+    backend = pytest.importorskip("torch._lazy.ts_backend")
+    backend.init()
+    return "lazy"
+
+
+def every_op(points: torch.Tensor, truth: torch.Tensor, camera: dp.PinholeCamera) -> list[torch.Tensor]:
+    splat = dp.splat_depth(points, camera)
+    sample = dp.sample_view(points, splat)
+    unprojected = dp.unproject(splat.depth, camera)
+    chosen = dp.farthest_point_sample(truth, 7, lengths=torch.full((2,), 40, device=truth.device))
+    horizon = dp.visible_points(points, camera, method="horizon")
+    outputs = [*splat, *sample, *dp.project(points, camera), *unprojected, chosen, horizon]
+    outputs += dp.reproject(splat.depth, camera, camera[[1, 0]])
+    outputs += [*dp.nearest(points, truth), *dp.chamfer_distance(points, truth, squared=False)]
+    outputs += dp.earth_mover_distance(points, truth)
+    # The lazy device lacks a view that torch takes in the backward pass of masked_scatter: no gradient of this one.
+    constraint = dp.front_constraint(points, camera, splat.depth.detach() + 0.1).detach()
+    return [*outputs, dp.approxmatch(points, truth), constraint]
+
+
+def test_tensors_of_another_device_come_back_on_it_with_their_gradient(elsewhere):
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(2, 60, 3, generator=generator) - 0.5
+    truth = torch.rand(2, 50, 3, generator=generator) - 0.5
+    results, gradients = {}, {}
+    for device in ("cpu", elsewhere):
+        moved = points.to(device).requires_grad_()
+        outputs = every_op(moved, truth.to(device), CAMERA.to(device))
+        assert {o.device.type for o in outputs} == {device}
+        total = sum(torch.where(torch.isfinite(o), o, 0.0).sum() for o in outputs if o.requires_grad)
+        (gradient,) = torch.autograd.grad(total, moved)
+        assert gradient.device.type == device
+        results[device], gradients[device] = [o.detach().cpu() for o in outputs], gradient.cpu()
+    for here, there in zip(results["cpu"], results[elsewhere], strict=True):
+        assert torch.allclose(here, there, atol=1e-5)
+    assert torch.allclose(gradients["cpu"], gradients[elsewhere], atol=1e-4)
+
+
+def test_devices_are_not_mixed(elsewhere):
+    points = torch.rand(2, 60, 3)
+    lengths = torch.tensor([3, 4])
+    depth = torch.full((2, 2, 16, 14), 2.0)
+    for call, name in (
+        (lambda: dp.splat_depth(points.to(elsewhere), CAMERA), "camera"),
+        (lambda: dp.splat_depth(points, CAMERA, lengths=lengths.to(elsewhere)), "lengths"),
+        (lambda: dp.visible_points(points, CAMERA, lengths=lengths.to(elsewhere)), "lengths"),
+        (lambda: dp.sample_view(points, torch.ones(2, 2, 60, dtype=torch.bool, device=elsewhere)), "splat"),
+        (lambda: dp.project(points, CAMERA.to(elsewhere)), "camera"),
+        (lambda: dp.reproject(depth, CAMERA, CAMERA.to(elsewhere)), "target"),
+        (lambda: dp.nearest(points, points.to(elsewhere)), "b"),
+        (lambda: dp.nearest(points, points, b_lengths=lengths.to(elsewhere)), "b_lengths"),
+        (lambda: dp.farthest_point_sample(points, 2, lengths=lengths.to(elsewhere)), "lengths"),
+        (lambda: dp.projection_loss(points, CAMERA, depth.to(elsewhere)), "depth"),
+        (lambda: dp.PinholeCamera(CAMERA.K.to(elsewhere), CAMERA.cam_from_world, 16, 14), "cam_from_world"),
+    ):
+        with pytest.raises(ValueError, match=f"'{name}' must be on the device of the other arguments"):
+            call()

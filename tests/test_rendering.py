@@ -344,3 +344,44 @@ def test_boundary_points_are_those_that_two_renderers_may_place_differently():
     theirs = reference.project(points.double(), camera.K.double(), camera.cam_from_world.double())[0].floor()
     moved = (ours != theirs).any(-1)
     assert not (moved & ~boundary_points(points, camera, margin=1e-4)).any()
+
+
+@pytest.mark.parametrize("radius", [0.0, 1.2])
+def test_a_large_cloud_in_parts_gives_the_maps_of_the_whole(radius):
+    """A lone large cloud is shared out among the threads; nine of them are not. Copies of points make equal depths."""
+    camera = cameras(torch.float32)[0, 0]
+    few = torch.rand(1, 20_000, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    points = torch.cat((few, few.flip(1)), dim=1)
+    lengths = torch.tensor([39_000])
+    alone = dp.splat_depth(points, camera, radius=radius, lengths=lengths)
+    many = dp.splat_depth(points.expand(9, -1, -1), camera, radius=radius, lengths=lengths.expand(9))
+    for x, y in zip(alone, many, strict=True):
+        assert torch.equal(x.expand_as(y), y)
+    assert (alone.index < 20_000).all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("radius", [30.0, 3e9, 1e30])
+def test_a_radius_larger_than_the_map_covers_all_of_it(dtype, radius):
+    camera = cameras(dtype)
+    splat = dp.splat_depth(clouds(dtype), camera, radius=radius)
+    depth = dp.project(clouds(dtype), camera).depth
+    assert torch.equal(splat.index, depth.argmin(-1)[..., None, None].expand(splat.index.shape))
+
+
+@pytest.mark.parametrize("where", [0, 5, 64, 69])
+def test_a_coordinate_that_is_not_finite_is_found_wherever_it_is(where):
+    points = torch.rand(2, 70, 3) - 0.5
+    points[1, where, 1] = torch.nan
+    for op in (dp.splat_depth, dp.project):
+        with pytest.raises(ValueError, match=rf"'points' must be finite; got nan at index \(1, {where}, 1\)"):
+            op(points, cameras(torch.float32))
+    padded = dp.splat_depth(points, cameras(torch.float32), lengths=torch.tensor([70, where]))
+    assert not padded.visible[1, :, where:].any()
+
+
+def test_finite_coordinates_may_be_so_large_that_their_depths_are_not():
+    camera = cameras(torch.float32)
+    points = clouds(torch.float32)
+    far = torch.cat((points, torch.full((2, 1, 3), 3e38)), dim=1)
+    assert torch.equal(dp.splat_depth(far, camera).index, dp.splat_depth(points, camera).index)

@@ -4,6 +4,8 @@ from types import SimpleNamespace
 
 from diffpoint.kernels._backend import ti
 
+TILE = 8  # points at once, in vector registers
+
 
 def build(real):
     points3 = ti.types.ndarray(dtype=real, ndim=3)
@@ -18,21 +20,25 @@ def build(real):
         projection: reals,
         pixels: reals,
         depth: reals,
+        total: reals,
         views: ti.i32,
         count: ti.i32,
         spread: ti.i32,
     ):
+        """`total` receives the sum of each view's depths: NaN or infinite if a coordinate of a point is."""
         for step in range(projection.shape[0] // 12 * spread):
             if step % spread == 0:
                 view = step // spread
                 cloud = view // views
                 m = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
+                sum_of_depths = real(0.0)
                 for i in range(count):
                     source = (cloud * count + i) * 3
                     x = points[source]
                     y = points[source + 1]
                     z = points[source + 2]
                     d = m[8] * x + m[9] * y + m[10] * z + m[11]
+                    sum_of_depths += d
                     inverse = real(1.0) / d  # as in the splat, so that both put a point in the same pixel
                     u = (m[0] * x + m[1] * y + m[2] * z + m[3]) * inverse
                     v = (m[4] * x + m[5] * y + m[6] * z + m[7]) * inverse
@@ -40,6 +46,19 @@ def build(real):
                     pixels[2 * target] = ti.select(d > 0, u, real(ti.math.inf))
                     pixels[2 * target + 1] = ti.select(d > 0, v, real(ti.math.inf))
                     depth[target] = d
+                total[view] = sum_of_depths
+
+    @ti.func
+    def pull_back(m: ti.template(), x, y, z, g_u, g_v, g_d):
+        """Gradients to the rows times (x, y, z, 1), which are (u d, v d, d); of one point or of a vector of them."""
+        d = m[8] * x + m[9] * y + m[10] * z + m[11]
+        before = d > real(0.0)  # the camera
+        inverse = real(1.0) / ti.select(before, d, real(1.0))
+        g0 = ti.select(before, g_u * inverse, real(0.0))
+        g1 = ti.select(before, g_v * inverse, real(0.0))
+        u = (m[0] * x + m[1] * y + m[2] * z + m[3]) * inverse
+        v = (m[4] * x + m[5] * y + m[6] * z + m[7]) * inverse
+        return g0, g1, g_d - g0 * u - g1 * v
 
     @ti.kernel
     def project_backward(
@@ -53,33 +72,71 @@ def build(real):
         count: ti.i32,
         spread: ti.i32,
     ):
+        """One thread owns one cloud and all its views. (`a[i] += x` would be an atomic addition, and slow.)"""
+        tiles = count // TILE
         for step in range(points.shape[0] // (3 * count) * spread):
             if step % spread == 0:
                 cloud = step // spread
                 for view in range(cloud * views, cloud * views + views):
+                    first = view == cloud * views
                     m = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
-                    total = ti.Vector([real(0.0) for e in ti.static(range(12))])
-                    for i in range(count):
+                    # Sums for the matrix: rows 0 to 2 of the gradients times x, y, z and 1, in each lane of the tile.
+                    x0 = ti.Vector([real(0.0) for _ in ti.static(range(TILE))])
+                    y0, z0, w0, x1, y1, z1, w1, x2, y2, z2, w2 = x0, x0, x0, x0, x0, x0, x0, x0, x0, x0, x0
+                    for t in range(tiles):
+                        source = (cloud * count + t * TILE) * 3
+                        target = view * count + t * TILE
+                        x = ti.Vector([points[source + 3 * s] for s in ti.static(range(TILE))])
+                        y = ti.Vector([points[source + 3 * s + 1] for s in ti.static(range(TILE))])
+                        z = ti.Vector([points[source + 3 * s + 2] for s in ti.static(range(TILE))])
+                        g_u = ti.Vector([grad_pixels[2 * (target + s)] for s in ti.static(range(TILE))])
+                        g_v = ti.Vector([grad_pixels[2 * (target + s) + 1] for s in ti.static(range(TILE))])
+                        g_d = ti.Vector([grad_depth[target + s] for s in ti.static(range(TILE))])
+                        g0, g1, g2 = pull_back(m, x, y, z, g_u, g_v, g_d)
+                        x0 += g0 * x
+                        y0 += g0 * y
+                        z0 += g0 * z
+                        w0 += g0
+                        x1 += g1 * x
+                        y1 += g1 * y
+                        z1 += g1 * z
+                        w1 += g1
+                        x2 += g2 * x
+                        y2 += g2 * y
+                        z2 += g2 * z
+                        w2 += g2
+                        for s in ti.static(range(TILE)):
+                            for k in ti.static(range(3)):
+                                g = g0[s] * m[k] + g1[s] * m[4 + k] + g2[s] * m[8 + k]
+                                at = source + 3 * s + k
+                                grad_points[at] = ti.select(first, g, grad_points[at] + g)
+                    total = ti.Vector(
+                        [
+                            x0.sum(), y0.sum(), z0.sum(), w0.sum(),
+                            x1.sum(), y1.sum(), z1.sum(), w1.sum(),
+                            x2.sum(), y2.sum(), z2.sum(), w2.sum(),
+                        ]
+                    )  # fmt: skip
+                    for i in range(tiles * TILE, count):
                         source = (cloud * count + i) * 3
                         target = view * count + i
-                        x = points[source]
-                        y = points[source + 1]
-                        z = points[source + 2]
-                        d = m[8] * x + m[9] * y + m[10] * z + m[11]
-                        # Gradients of the three rows' products with (x, y, z, 1): (u d, v d, d).
-                        inverse = real(1.0) / ti.select(d > 0, d, real(1.0))
-                        g0 = ti.select(d > 0, grad_pixels[2 * target] * inverse, real(0.0))
-                        g1 = ti.select(d > 0, grad_pixels[2 * target + 1] * inverse, real(0.0))
-                        u = (m[0] * x + m[1] * y + m[2] * z + m[3]) * inverse
-                        v = (m[4] * x + m[5] * y + m[6] * z + m[7]) * inverse
-                        g2 = grad_depth[target] - g0 * u - g1 * v
-                        for k in ti.static(range(3)):
-                            grad_points[source + k] += g0 * m[k] + g1 * m[4 + k] + g2 * m[8 + k]
-                        p = ti.Vector([x, y, z, real(1.0)])
+                        p = ti.Vector([points[source], points[source + 1], points[source + 2], real(1.0)])
+                        g0, g1, g2 = pull_back(
+                            m,
+                            p[0],
+                            p[1],
+                            p[2],
+                            grad_pixels[2 * target],
+                            grad_pixels[2 * target + 1],
+                            grad_depth[target],
+                        )
                         for k in ti.static(range(4)):
                             total[k] += g0 * p[k]
                             total[4 + k] += g1 * p[k]
                             total[8 + k] += g2 * p[k]
+                        for k in ti.static(range(3)):
+                            g = g0 * m[k] + g1 * m[4 + k] + g2 * m[8 + k]
+                            grad_points[source + k] = ti.select(first, g, grad_points[source + k] + g)
                     for e in ti.static(range(12)):
                         grad_projection[view * 12 + e] = total[e]
 

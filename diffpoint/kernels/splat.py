@@ -4,9 +4,11 @@ from types import SimpleNamespace
 
 from diffpoint.kernels._backend import ti
 
+TILE = 8  # points whose image positions are computed at once, in vector registers
+
 
 def build(real):
-    # Flat arrays and the camera in registers: indexing in three dimensions would cost more than the arithmetic.
+    # The camera in registers, clouds as flat arrays: indexing in three dimensions would cost more than the arithmetic.
     reals = ti.types.ndarray(dtype=real, ndim=1)
     integers = ti.types.ndarray(dtype=ti.i64, ndim=1)
     flags = ti.types.ndarray(dtype=ti.u8, ndim=1)
@@ -15,115 +17,194 @@ def build(real):
     flags2 = ti.types.ndarray(dtype=ti.u8, ndim=2)
 
     @ti.func
-    def clear(depth: ti.template(), index: ti.template(), visible: ti.template(), view, pixels, count):
-        for p in range(view * pixels, view * pixels + pixels):
-            depth[p] = real(ti.math.inf)
-        for p in range(view * pixels, view * pixels + pixels):
-            index[p] = -1
-        for i in range(view * count, view * count + count):
-            visible[i] = ti.u8(0)
-
-    @ti.func
-    def mark_winners(index: ti.template(), visible: ti.template(), view, pixels, count):
-        for p in range(view * pixels, view * pixels + pixels):
-            i = ti.cast(index[p], ti.i32)
-            if i >= 0:
-                visible[view * count + i] = ti.u8(1)
-
-    @ti.func
-    def image_position(points: ti.template(), camera: ti.template(), offset):
-        x = points[offset]
-        y = points[offset + 1]
-        z = points[offset + 2]
+    def image_position(camera: ti.template(), x, y, z):
+        """Pixel position and depth, of one point or of a vector of them: the same operations, hence the same bits."""
         d = camera[8] * x + camera[9] * y + camera[10] * z + camera[11]
         inverse = real(1.0) / d
         u = (camera[0] * x + camera[1] * y + camera[2] * z + camera[3]) * inverse
         v = (camera[4] * x + camera[5] * y + camera[6] * z + camera[7]) * inverse
         return u, v, d
 
-    @ti.kernel
-    def forward(
-        points: reals,
-        lengths: integers,
-        projection: reals,
-        depth: reals,
-        index: integers,
-        visible: flags,
-        views: ti.i32,
-        count: ti.i32,
-        height: ti.i32,
-        width: ti.i32,
-        spread: ti.i32,
+    @ti.func
+    def fill(values: ti.template(), start, stop, value):
+        """Sixteen at a time, because a loop between two computed bounds is not packed."""
+        blocks = (stop - start) // 16
+        for block in range(blocks):
+            for s in ti.static(range(16)):
+                values[start + block * 16 + s] = value
+        for i in range(start + blocks * 16, stop):
+            values[i] = value
+
+    @ti.func
+    def cover_one(
+        depth: ti.template(), index: ti.template(), visible: ti.template(), start, i, u, v, d, size
     ):
-        """One pixel per point. One thread owns one map; the nearest depth wins, then the lowest index."""
-        pixels = height * width
-        for step in range(lengths.shape[0] * views * spread):
-            if step % spread == 0:
-                view = step // spread
-                cloud = view // views
-                clear(depth, index, visible, view, pixels, count)
-                camera = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
-                columns = ti.cast(width, real)
-                rows = ti.cast(height, real)
-                for i in range(ti.cast(lengths[cloud], ti.i32)):
-                    u, v, d = image_position(points, camera, (cloud * count + i) * 3)
-                    # Bitwise "and", and a select for the winner: both choices are cheaper than a missed branch.
-                    if (d > real(0.0)) & (u >= real(0.0)) & (u < columns) & (v >= real(0.0)) & (v < rows):
-                        p = view * pixels + ti.cast(v, ti.i32) * width + ti.cast(u, ti.i32)
-                        wins = d < depth[p]
-                        depth[p] = ti.select(wins, d, depth[p])
-                        index[p] = ti.select(wins, ti.cast(i, ti.i64), index[p])
-                mark_winners(index, visible, view, pixels, count)
+        """Point `i` competes for its pixel of the map at start[0]; visible, at start[1], follows who owns it."""
+        if (d > real(0.0)) & (u >= real(0.0)) & (u < size[1]) & (v >= real(0.0)) & (v < size[0]):
+            p = start[0] + ti.cast(v, ti.i32) * ti.cast(size[1], ti.i32) + ti.cast(u, ti.i32)
+            # Selects instead of branches: whether a point wins cannot be foreseen, and a missed branch costs more.
+            owner = ti.cast(index[p], ti.i32)
+            before = depth[p]
+            wins = d < before
+            depth[p] = ti.select(wins, d, before)
+            index[p] = ti.select(wins, i, owner)
+            visible[start[1] + ti.select(wins & (owner >= 0), owner, i)] = ti.u8(0)
+            visible[start[1] + i] = ti.cast(wins, ti.u8)
+
+    @ti.func
+    def floor_within(x, size):
+        """floor(x) cut to [-1, size], so that it fits an integer; a call of ti.floor would cost ten times as much."""
+        return ti.select(x >= real(0.0), ti.cast(ti.select(x < size, x, size), ti.i32), -1)
+
+    @ti.func
+    def ceil_within(x, size):
+        below = floor_within(x, size)
+        return ti.select(ti.cast(below, real) < x, below + 1, below)
+
+    @ti.func
+    def cover_disc(depth: ti.template(), index: ti.template(), start, i, u, v, d, size, radius):
+        """Point `i` competes for its own pixel and for those whose centre lies within `radius` pixels of it."""
+        margin = radius + real(1.0)
+        half = real(0.5)
+        if (d > real(0.0)) & (u > -margin) & (u < size[1] + margin) & (v > -margin) & (v < size[0] + margin):
+            own_row = floor_within(v, size[0])
+            own_column = floor_within(u, size[1])
+            top = ti.max(ti.min(ceil_within(v - radius - half, size[0]), own_row), 0)
+            left = ti.max(ti.min(ceil_within(u - radius - half, size[1]), own_column), 0)
+            width = ti.cast(size[1], ti.i32)
+            bottom = ti.max(floor_within(v + radius - half, size[0]), own_row)
+            bottom = ti.min(bottom, ti.cast(size[0], ti.i32) - 1)
+            right = ti.min(ti.max(floor_within(u + radius - half, size[1]), own_column), width - 1)
+            # One loop over both: a loop over a row's few pixels would be unrolled and guarded at greater cost.
+            row = top
+            column = left
+            for _ in range(ti.max(bottom - top + 1, 0) * ti.max(right - left + 1, 0)):
+                p = start[0] + row * width + column
+                du = ti.cast(column, real) + half - u
+                dv = ti.cast(row, real) + half - v
+                # Each select hangs on one comparison of floats: of several conditions a branch would be made.
+                apart = ti.select((row == own_row) & (column == own_column), 0, 1)
+                reached = ti.cast(apart, real) * (du * du + dv * dv) <= radius * radius
+                candidate = ti.select(reached, d, real(ti.math.inf))
+                before = depth[p]
+                owner = index[p]
+                wins = candidate < before
+                depth[p] = ti.select(wins, candidate, before)
+                index[p] = ti.select(wins, ti.cast(i, ti.i64), owner)
+                ends = column == right
+                row = ti.select(ends, row + 1, row)
+                column = ti.select(ends, left, column + 1)
+
+    @ti.func
+    def mark_owners(index: ti.template(), visible: ti.template(), start, pixels):
+        """Without a branch: an empty pixel marks point 0, whose own flag is put right afterwards."""
+        owned = ti.u8(0)
+        for p in range(start[0], start[0] + pixels):
+            owner = ti.cast(index[p], ti.i32)
+            visible[start[1] + ti.max(owner, 0)] = ti.u8(1)
+            owned = ti.select(owner == 0, ti.u8(1), owned)
+        visible[start[1]] = owned
+
+    def make_forward(disc, serial):
+        """The splat of single pixels or of discs; on all threads, or without waking them for a small cloud."""
+
+        @ti.kernel
+        def forward(
+            points: reals,
+            lengths: integers,
+            projection: reals,
+            depth: reals,
+            index: integers,
+            visible: flags,
+            total: reals,
+            views: ti.i32,
+            parts: ti.i32,
+            count: ti.i32,
+            height: ti.i32,
+            width: ti.i32,
+            radius: real,
+            spread: ti.i32,
+        ):
+            """One thread owns one map; the nearest depth wins, then the lowest index.
+
+            The points of a view may be shared out among `parts` maps, which `merge` then brings together. `total`
+            receives the sum of the depths of each map's points: it is NaN or infinite if one of their coordinates is.
+            """
+            ti.loop_config(serialize=serial)
+            pixels = height * width
+            for step in range(total.shape[0] * spread):
+                if step % spread == 0:
+                    at = step // spread
+                    view = at // parts
+                    cloud = view // views
+                    start = ti.Vector([at * pixels, view * count])  # of the map, and of the view's flags
+                    fill(depth, start[0], start[0] + pixels, real(ti.math.inf))
+                    fill(index, start[0], start[0] + pixels, ti.i64(-1))
+                    share = (count + parts - 1) // parts
+                    first = (at % parts) * share
+                    stop = ti.min(first + share, count)
+                    fill(visible, start[1] + first, start[1] + stop, ti.u8(0))
+                    last = ti.min(ti.cast(lengths[cloud], ti.i32), stop)
+                    camera = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
+                    size = ti.Vector([ti.cast(height, real), ti.cast(width, real)])
+                    # The loops over a disc outweigh the arithmetic of its point, and are not worth eight copies.
+                    tiles = 0 if ti.static(disc) else ti.max(last - first, 0) // TILE
+                    sums = ti.Vector([real(0.0) for _ in ti.static(range(TILE))])
+                    for t in range(tiles):
+                        i = first + t * TILE
+                        offset = (cloud * count + i) * 3
+                        x = ti.Vector([points[offset + 3 * s] for s in ti.static(range(TILE))])
+                        y = ti.Vector([points[offset + 3 * s + 1] for s in ti.static(range(TILE))])
+                        z = ti.Vector([points[offset + 3 * s + 2] for s in ti.static(range(TILE))])
+                        u, v, d = image_position(camera, x, y, z)
+                        sums += d
+                        for s in ti.static(range(TILE)):
+                            cover_one(depth, index, visible, start, i + s, u[s], v[s], d[s], size)
+                    rest = sums.sum()
+                    for i in range(first + tiles * TILE, last):
+                        offset = (cloud * count + i) * 3
+                        u, v, d = image_position(
+                            camera, points[offset], points[offset + 1], points[offset + 2]
+                        )
+                        rest += d
+                        if ti.static(disc):
+                            cover_disc(depth, index, start, i, u, v, d, size, radius)
+                        else:
+                            cover_one(depth, index, visible, start, i, u, v, d, size)
+                    total[at] = rest
+                    if ti.static(disc) and parts == 1:
+                        mark_owners(index, visible, start, pixels)
+
+        return forward
 
     @ti.kernel
-    def forward_disc(
-        points: reals,
-        lengths: integers,
-        projection: reals,
+    def merge(
+        part_depth: reals,
+        part_index: integers,
         depth: reals,
         index: integers,
         visible: flags,
-        views: ti.i32,
+        parts: ti.i32,
         count: ti.i32,
-        height: ti.i32,
-        width: ti.i32,
-        radius: real,
+        pixels: ti.i32,
         spread: ti.i32,
     ):
-        """Each point covers its own pixel and those whose centre lies within `radius` pixels of it."""
-        pixels = height * width
-        for step in range(lengths.shape[0] * views * spread):
+        """Maps of the parts of a cloud into one: parts are in the order of the points, so the first of equals wins."""
+        for step in range(depth.shape[0] // pixels * spread):
             if step % spread == 0:
                 view = step // spread
-                cloud = view // views
-                clear(depth, index, visible, view, pixels, count)
-                camera = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
-                margin = radius + real(1.0)
-                half = real(0.5)
-                for i in range(ti.cast(lengths[cloud], ti.i32)):
-                    u, v, d = image_position(points, camera, (cloud * count + i) * 3)
-                    if (d > 0) & (u > -margin) & (u < width + margin) & (v > -margin) & (v < height + margin):
-                        own_column = ti.cast(ti.floor(u), ti.i32)
-                        own_row = ti.cast(ti.floor(v), ti.i32)
-                        top = ti.max(ti.min(ti.cast(ti.ceil(v - radius - half), ti.i32), own_row), 0)
-                        bottom = ti.min(
-                            ti.max(ti.cast(ti.floor(v + radius - half), ti.i32), own_row), height - 1
-                        )
-                        left = ti.max(ti.min(ti.cast(ti.ceil(u - radius - half), ti.i32), own_column), 0)
-                        right = ti.min(
-                            ti.max(ti.cast(ti.floor(u + radius - half), ti.i32), own_column), width - 1
-                        )
-                        for row in range(top, bottom + 1):
-                            for column in range(left, right + 1):
-                                p = view * pixels + row * width + column
-                                du = ti.cast(column, real) + half - u
-                                dv = ti.cast(row, real) + half - v
-                                covered = du * du + dv * dv <= radius * radius
-                                own = (row == own_row) & (column == own_column)
-                                wins = (covered | own) & (d < depth[p])
-                                depth[p] = ti.select(wins, d, depth[p])
-                                index[p] = ti.select(wins, ti.cast(i, ti.i64), index[p])
-                mark_winners(index, visible, view, pixels, count)
+                for p in range(pixels):
+                    d = real(ti.math.inf)
+                    owner = ti.i64(-1)
+                    for part in range(parts):
+                        candidate = part_depth[(view * parts + part) * pixels + p]
+                        wins = candidate < d
+                        d = ti.select(wins, candidate, d)
+                        owner = ti.select(wins, part_index[(view * parts + part) * pixels + p], owner)
+                    depth[view * pixels + p] = d
+                    index[view * pixels + p] = owner
+                fill(visible, view * count, (view + 1) * count, ti.u8(0))
+                mark_owners(index, visible, ti.Vector([view * pixels, view * count]), pixels)
 
     @ti.kernel
     def backward(
@@ -138,10 +219,12 @@ def build(real):
         pixels: ti.i32,
         spread: ti.i32,
     ):
-        """depth = projection[2] @ (point, 1). One thread owns one cloud and all its views."""
+        """depth = projection[2] @ (point, 1). One thread owns one cloud and all its views, so no addition is atomic."""
         for step in range(points.shape[0] // (3 * count) * spread):
             if step % spread == 0:
                 cloud = step // spread
+                for e in range(cloud * count * 3, (cloud + 1) * count * 3):
+                    grad_points[e] = real(0.0)
                 for view in range(cloud * views, cloud * views + views):
                     row = ti.Vector([projection[view * 12 + 8 + k] for k in ti.static(range(3))])
                     total = ti.Vector([real(0.0) for k in ti.static(range(4))])
@@ -151,9 +234,11 @@ def build(real):
                             g = grad_depth[p]
                             offset = (cloud * count + i) * 3
                             for k in ti.static(range(3)):
-                                grad_points[offset + k] += g * row[k]
+                                grad_points[offset + k] = grad_points[offset + k] + g * row[k]
                                 total[k] += g * points[offset + k]
                             total[3] += g
+                    for e in ti.static(range(8)):
+                        grad_projection[view * 12 + e] = real(0.0)
                     for k in ti.static(range(4)):
                         grad_projection[view * 12 + 8 + k] = total[k]
 
@@ -195,11 +280,16 @@ def build(real):
                         i = ti.cast(index[view, slot], ti.i32)
                         if i >= 0:
                             for k in ti.static(range(3)):
-                                grad_points[cloud, i, k] += grad_sampled[view, slot, k]
+                                grad_points[cloud, i, k] = (
+                                    grad_points[cloud, i, k] + grad_sampled[view, slot, k]
+                                )
 
     return SimpleNamespace(
-        forward=forward,
-        forward_disc=forward_disc,
+        forward=make_forward(disc=False, serial=False),
+        forward_alone=make_forward(disc=False, serial=True),
+        forward_disc=make_forward(disc=True, serial=False),
+        forward_disc_alone=make_forward(disc=True, serial=True),
+        merge=merge,
         backward=backward,
         gather_visible=gather_visible,
         scatter_visible=scatter_visible,
