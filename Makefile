@@ -1,11 +1,11 @@
-# make demo | test | check | bench | docs | clean. Each installs what it needs into .venv first.
+# make demo | test | slow | check | bench | publish | docs | clean. Each installs what it needs into .venv first.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # torch's OpenMP threads would otherwise spin after each op and slow the next kernel.
 export OMP_WAIT_POLICY := passive
 
-.PHONY: demo test slow check bench docs clean
+.PHONY: demo test slow check bench publish docs clean
 .DEFAULT_GOAL := test
 
 $(VENV)/installed: pyproject.toml constraints.txt
@@ -30,8 +30,18 @@ check: $(VENV)/installed
 	$(BIN)/pyright
 	$(BIN)/python -m pytest tests/test_project.py
 
-bench: $(VENV)/installed
-	$(BIN)/python -m benchmarks
+$(VENV)/peers: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[train,bench]' \
+		|| echo "make: not every peer can be installed here; the bench runs without them"
+	@touch $@
+
+# PARTS="races sweep" runs some parts, ARGS="--quick" or ARGS="--only chamfer" less of them; see benchmarks --help.
+bench: $(VENV)/peers
+	$(BIN)/python -m benchmarks $(PARTS) $(ARGS)
+
+# Puts the tables of the last bench on this machine into README.md and docs/performance.md.
+publish: $(VENV)/installed
+	$(BIN)/python -m benchmarks publish
 
 docs: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'

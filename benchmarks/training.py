@@ -1,0 +1,158 @@
+"""Where a training step's time goes, and the same step with the plain twins of `diffpoint.reference`.
+
+The data are made up and lie in memory: reading files is no part of a step. Predictions are those of a network that has
+made a few steps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+from unittest import mock
+
+import torch
+from torch import Tensor
+
+import diffpoint as dp
+from benchmarks.inputs import surfaces
+from benchmarks.peers import optional
+from diffpoint import reference
+from models import PROFILES as SIZES
+from train.batches import LoadedSplit
+from train.config import PROFILES, FitConfig, StageConfig
+from train.state import Training
+
+_SHAPES, _VIEWS = 16, 8
+_STEPS = {"smoke": (5, 10), "cpu": (5, 8), "full": (1, 2)}
+"""Steps to warm up, and steps to measure."""
+_TWINS = ("smoke", "cpu")  # with the full profile, the twins' matrices would not fit the memory
+
+
+def measure(*, quick: bool = False) -> Iterator[dict[str, Any]]:
+    """A row for both stages of each profile."""
+    for profile in ("smoke", "cpu") if quick else ("smoke", "cpu", "full"):
+        config = PROFILES[profile]
+        training = Training(config, _data(config))
+        for name in ("stage1", "stage2"):
+            training._enter(name)  # begin_phase would look for the weights of the phase before
+            stage = training.phase
+            assert isinstance(stage, StageConfig)
+            warm, steps = _STEPS[profile]
+            # Where the diversity loss has its full weight, and the step size is small enough to stay put.
+            training.step = min(stage.ramp[1] + 1, stage.steps - 1)
+            row = {"profile": profile, "stage": name[-1], **_shares(training, warm, 2 if quick else steps)}
+            if profile in _TWINS:
+                with twins():
+                    row["twins_ratio"] = 1e3 * _seconds(training.advance) / row["ms"]
+                if optimize := optional("scipy.optimize"):
+                    solve = optimize.linear_sum_assignment
+                    with twins(lambda cost, solve=solve: torch.from_numpy(solve(cost)[1])):
+                        row["scipy_ratio"] = 1e3 * _seconds(training.advance) / row["ms"]
+            parts = ", ".join(f"{part} {share:.0%}" for part, share in row["shares"].items())
+            print(f"  {profile}, stage {row['stage']}: {row['ms']:.0f} ms a step ({parts})", flush=True)
+            yield row
+
+
+def _shares(training: Training, warm: int, steps: int) -> dict[str, Any]:
+    """Median milliseconds of a step, and the shares of its parts."""
+    from train import objective
+
+    for _ in range(warm):
+        training.advance()
+    milliseconds: list[float] = []
+    parts: dict[str, list[float]] = {}
+    rendering: list[float] = []
+
+    def timed(*arguments: Any) -> Any:
+        start = time.perf_counter()
+        result = front_sets(*arguments)
+        rendering.append(time.perf_counter() - start)
+        return result
+
+    front_sets = objective.front_sets
+    with mock.patch.object(objective, "front_sets", timed):
+        for _ in range(steps):
+            rendering.clear()
+            training.laps.begin()
+            milliseconds.append(1e3 * _seconds(training.advance))
+            laps = {k.removesuffix("_seconds"): v for k, v in training.laps.read().items()}
+            laps["splat and sample"] = sum(rendering)
+            laps["distances"] -= sum(rendering)
+            for part in ("network", "critic", "splat and sample", "distances", "data"):
+                parts.setdefault(part, []).append(laps.get(part, 0.0))
+    whole = sum(map(statistics.median, parts.values()))
+    shares = {part: statistics.median(values) / whole for part, values in parts.items()}
+    return {
+        "ms": statistics.median(milliseconds),
+        "shares": shares,
+        "layer_share": shares["splat and sample"] + shares["distances"],
+    }
+
+
+def _seconds(function: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+def _data(config: FitConfig) -> LoadedSplit:
+    """Shapes made of boxes, their depth maps, and noise for images."""
+    size, side = SIZES[config.profile], config.map_size
+    points = surfaces(_SHAPES, 4096)
+    azimuth = torch.linspace(0, 2 * torch.pi, _VIEWS + 1)[:-1]
+    eyes = 2 * torch.stack((0.95 * azimuth.cos(), torch.full_like(azimuth, 0.3), 0.95 * azimuth.sin()), -1)
+    camera = dp.PinholeCamera.look_at(eyes, focal_px=420 * side / 224, height=side, width=side)
+    camera = camera.expand(_SHAPES, _VIEWS)
+    return LoadedSplit(
+        images=torch.randint(
+            0, 256, (_SHAPES, _VIEWS, 3, size.image_height, size.image_width), dtype=torch.uint8
+        ),
+        depth=dp.splat_depth(points, camera, radius=1.0).depth,
+        K=camera.K.clone(),
+        cam_from_world=camera.cam_from_world.clone(),
+        points=points,
+        ids=[f"made/{i}" for i in range(_SHAPES)],
+        categories=["boxes"] * _SHAPES,
+    )
+
+
+@contextlib.contextmanager
+def twins(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
+    """Within, the losses of training run on `diffpoint.reference`.
+
+    Args:
+        assign: instead of the twin's own search for the best assignment, which takes a second a pair.
+    """
+    from diffpoint import losses
+    from train import objective, step
+
+    def visible_points(points: Tensor, camera: dp.PinholeCamera, **_: Any) -> Tensor:
+        return reference.splat_depth(points, camera.K, camera.cam_from_world, camera.height, camera.width)[2]
+
+    def sample_view(points: Tensor, visible: Tensor) -> dp.ViewSample:
+        return dp.ViewSample(*reference.sample_view(points, visible))
+
+    def unproject(depth: Tensor, camera: dp.PinholeCamera) -> dp.PointSets:
+        return dp.PointSets(*reference.unproject(depth, camera.K, camera.cam_from_world))
+
+    def chamfer_distance(a: Tensor, b: Tensor, **options: Any) -> dp.Chamfer:
+        return dp.Chamfer(*reference.chamfer_distance(a, b, **options))
+
+    def earth_mover_distance(
+        a: Tensor, b: Tensor, *, tolerance: float = 0.0, **lengths: Tensor
+    ) -> dp.Transport:
+        del tolerance  # the twin is exact
+        cost, assignment = reference.earth_mover_distance(a, b, **lengths)
+        return dp.Transport(cost, assignment, torch.zeros_like(cost), torch.ones_like(cost, dtype=torch.bool))
+
+    replacements = [visible_points, sample_view, unproject, chamfer_distance, earth_mover_distance]
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(mock.patch.object(reference, "assign", assign))
+        for module in (losses, objective, step):
+            for function in replacements:
+                if hasattr(module, function.__name__):
+                    stack.enter_context(mock.patch.object(module, function.__name__, function))
+        yield
