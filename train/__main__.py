@@ -115,6 +115,28 @@ class Check:
 
 
 @dataclasses.dataclass
+class Show:
+    """Draw a contact sheet for each category of a data tree: views, depth, and the cloud from front and back."""
+
+    data: Positional[Path]
+    """Root of the data tree."""
+    out: Path | None = None
+    """Folder of the sheets; contact/ in the data tree if not given."""
+    categories: tuple[str, ...] = ()
+    """Categories to draw; none means all."""
+    shapes: int = 8
+    """Rows of a sheet."""
+
+    def run(self) -> None:
+        from train.data.show import show
+
+        for category, path in show(
+            self.data, self.out, categories=self.categories or None, shapes=self.shapes
+        ).items():
+            print(f"{category}: {path}")
+
+
+@dataclasses.dataclass
 class Rules:
     """Measure on fresh objects whether the fronts of the families hide their backs; see docs/families.md."""
 
@@ -141,6 +163,7 @@ class Data:
         Annotated[Procedural, subcommand("procedural")]
         | Annotated[Meshes, subcommand("meshes")]
         | Annotated[Check, subcommand("check")]
+        | Annotated[Show, subcommand("show")]
         | Annotated[Rules, subcommand("rules")]
     ]
 
@@ -168,6 +191,7 @@ class Fit:
 
     def run(self) -> int:
         from train.fit import fit
+        from train.parallel import gather
 
         config = self.config
         if self.steps is not None:
@@ -177,7 +201,8 @@ class Fit:
         if not fit(self.data, self.out, config, resume=self.resume):
             print(f"stopped early and saved; continue with --resume --out {self.out}", file=sys.stderr)
             return 130
-        print(f"trained; see {self.out}, or run: python -m train evaluate {self.out} --data {self.data}")
+        if gather().writes:
+            print(f"trained; see {self.out}, or run: python -m train evaluate {self.out} --data {self.data}")
         return 0
 
 

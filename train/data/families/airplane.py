@@ -31,7 +31,7 @@ _KINDS = {
                        ("nose", "nose", "wing propellers"), (0.08, 0.16)),
     "fighter": _Kind((0.04, 0.065), (0.22, 0.38), (35, 58), (0.3, 0.5), (0.1, 0.35), (-0.06, 0.04),
                      ("none", "twin"), (0.2, 0.34)),
-    "glider": _Kind((0.03, 0.05), (0.75, 1.15), (-2, 4), (0.08, 0.12), (0.4, 0.7), (0.1, 0.2),
+    "glider": _Kind((0.03, 0.05), (0.65, 0.9), (-2, 4), (0.08, 0.12), (0.4, 0.7), (0.1, 0.2),
                     ("none",), (0.1, 0.16)),
 }  # fmt: skip
 
@@ -51,12 +51,15 @@ def _design(visible: np.random.Generator) -> Design:
     dihedral = np.tan(np.radians(visible.uniform(-3, 8)))
     root = np.array((0.0, height, visible.uniform(*kind.wing_z)))
     tip = root + (half_span, dihedral * half_span, -np.tan(sweep) * half_span)
-    thickness = chord * visible.uniform(0.1, 0.16)
-    panel = wing(root, tip, (chord, chord * taper), (thickness, thickness * taper * 0.8), paint * 0.93)
+    least = 0.012 * max(1.0, 2.2 * half_span)  # thinner ones would slip between the pixels of a small picture
+    thickness = max(chord * visible.uniform(0.1, 0.16), 1.3 * least)
+    panel = wing(
+        root, tip, (chord, chord * taper), (thickness, max(thickness * taper * 0.8, least)), paint * 0.93
+    )
     parts += [panel, panel.mirrored()]
     if visible.random() < 0.3 and name == "airliner":
         up = tip + (0.01, 0.05, -0.03)
-        winglet = wing(tip, up, (chord * taper, chord * taper * 0.5), (0.006, 0.004), accent)
+        winglet = wing(tip, up, (chord * taper, chord * taper * 0.5), (0.012, 0.01), accent)
         parts += [winglet, winglet.mirrored()]
     parts += _tail(visible, radius, tall, paint, accent)
     engines = visible.choice(kind.engines)
@@ -109,13 +112,13 @@ def _tail(
             np.array((radius * 0.3, top, -0.4)),
             np.array((span * 0.7, top + height * 0.8, -0.4 - slant)),
         )
-        fin = wing(root, tip, (chord, chord * 0.5), (0.012, 0.006), accent)
+        fin = wing(root, tip, (chord, chord * 0.5), (0.017, 0.012), accent)
         return [fin, fin.mirrored()]
     root = np.array((0, top, -0.4))
     tip = root + (0, height, -slant)
-    fin = wing(root, tip, (chord, chord * 0.55), (0.014, 0.007), accent)
+    fin = wing(root, tip, (chord, chord * 0.55), (0.018, 0.012), accent)
     at = tip - (0, 0.008, 0) if kind == "T" else np.array((0, top, -0.44))
-    plane = wing(at, at + (span, 0.01, -back), (chord * 0.75, chord * 0.4), (0.012, 0.006), paint * 0.93)
+    plane = wing(at, at + (span, 0.01, -back), (chord * 0.75, chord * 0.4), (0.017, 0.012), paint * 0.93)
     return [fin, plane, plane.mirrored()]
 
 
@@ -167,7 +170,7 @@ def _propeller(
     """A spinner and its blades."""
     cone = revolved([(radius * 0.5, -0.02), (radius * 0.4, 0.02), (0.004, 0.06)], hub, colour, axis=(0, 0, 1))
     count, long = int(visible.integers(2, 5)), max(radius, 0.04) * visible.uniform(1.6, 2.4)
-    blade = box((0.018, 2 * long if count % 2 == 0 else long, 0.006), (0, 0, 0.012), colour)
+    blade = box((0.022, 2 * long if count % 2 == 0 else long, 0.012), (0, 0, 0.012), colour)
     if count % 2:
         blade = blade.moved((0, long / 2, 0))
     turns = count // 2 if count % 2 == 0 else count

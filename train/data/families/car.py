@@ -51,7 +51,7 @@ def _design(visible: np.random.Generator) -> Design:
         loft([_cabin(cabin_width, z, bottom, top, lean, roof) for z, bottom, top in stations], glass)
     )
     cap = roof - 0.012
-    lid = [(screen_z - rake * 0.94, cap - 0.002, roof + 0.004), (middle_z, cap, roof + 0.006)]
+    lid = [(screen_z - rake * 0.94, cap - 0.002, roof + 0.001), (middle_z, cap, roof + 0.003)]
     parts.append(
         loft(
             [oval(cabin_width * lean * 1.02, t - b, (0, (b + t) / 2, z), squareness=8) for z, b, t in lid],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from train.data.families.design import Design, Family, fitted, hsv, metal, wood
+from train.data.families.hull import Hull
 from train.data.solids import Solid, bar, box, ellipsoid, frustum, loft, revolved, sheet, tube
 
 
@@ -20,96 +21,8 @@ def _design(visible: np.random.Generator) -> Design:
 WATERCRAFT = Family(_design)
 
 
-class _Hull:
-    """A hull from z = -0.5 to 0.5 with its deck near y = 0.
-
-    Args:
-        visible: decides the lines within the ranges.
-        beam: range of the width.
-        draught: range of the depth below the deck.
-        transom: range of the stern's width, as a share of the beam.
-    """
-
-    def __init__(
-        self,
-        visible: np.random.Generator,
-        *,
-        beam: tuple[float, float],
-        draught: tuple[float, float],
-        transom: tuple[float, float] = (0.5, 0.9),
-    ) -> None:
-        self.beam, self.draught = visible.uniform(*beam), visible.uniform(*draught)
-        self.transom, self.fullness = visible.uniform(*transom), visible.uniform(1.6, 3.2)
-        self.sheer, self.rake = visible.uniform(0.1, 0.6) * self.draught, visible.uniform(0.0, 0.12)
-        self.flat = visible.uniform(0.15, 0.6)  # of the bottom, as a share of the beam
-
-    def half_beam(self, z: float) -> float:
-        """Half the deck's width at z."""
-        ahead = max(z, 0.0) / 0.5
-        behind = max(-z, 0.0) / 0.5
-        return self.beam / 2 * (1 - ahead**self.fullness) * (1 - (1 - self.transom) * behind**2)
-
-    def deck(self, z: float) -> float:
-        """Height of the deck at z: it rises towards the bow."""
-        return self.sheer * max(z + 0.1, 0.0) ** 2 / 0.36 + 0.15 * self.sheer * max(-z - 0.2, 0) / 0.3
-
-    def solid(self, colour: np.ndarray) -> Solid:
-        rings = []
-        for z in np.concatenate((np.linspace(-0.5, 0.3, 7), (0.38, 0.44, 0.48, 0.5))):
-            half, top = max(self.half_beam(z), 0.003), self.deck(z)
-            ahead = max(z, 0.0) / 0.5
-            keel = -self.draught * (1 - 0.75 * ahead**4)
-            sections = (
-                (1.0, top),
-                (0.94, top + 0.4 * (keel - top)),
-                (self.flat + 0.25, top + 0.8 * (keel - top)),
-                (self.flat * 0.5, keel),
-            )
-            right = np.array(
-                [
-                    (half * min(s, 1.0), y, z + self.rake * ahead**3 * (y - keel) / self.draught)
-                    for s, y in sections
-                ]
-            )
-            rings.append(np.concatenate((right, right[::-1] * (-1, 1, 1))))
-        return loft(rings, colour)
-
-    def stripe(self, colour: np.ndarray) -> list[Solid]:
-        """A rubbing strake along both sides of the deck."""
-        z = np.linspace(-0.5, 0.46, 12)
-        path = [(self.half_beam(at), self.deck(at) - 0.006, at) for at in z]
-        rail = tube(path, [0.009] * len(z), colour, sides=6)
-        return [rail, rail.mirrored()]
-
-    def house(
-        self,
-        z: tuple[float, float],
-        rise: float,
-        colour: np.ndarray,
-        *,
-        share: float = 0.7,
-        base: float = 0.0,
-        slant: float = 0.0,
-    ) -> Solid:
-        """A deckhouse between two z, as wide as a share of the deck, its ends slanted."""
-        rear, front = z
-        low = min(self.deck(rear), self.deck(front)) - 0.02 + base
-        high = max(self.deck(rear), self.deck(front)) + base + rise
-        wide = [2 * share * self.half_beam(at) for at in z]
-        corners = np.array([(-1, rear, 0), (1, rear, 0), (1, front, 1), (-1, front, 1)])
-        rings = []
-        for y, cut, narrow in ((low, 0.0, 1.0), (high, slant, 0.92)):
-            rings.append(
-                np.array([
-                    (side * wide[int(end)] / 2 * narrow, y, at + (cut * 0.4 if end == 0 else -cut))
-                    for side, at, end in corners
-                ])
-            )  # fmt: skip
-        return loft(rings, colour)
-
-
 def _sail(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) -> list[Solid]:
-    hull = _Hull(visible, beam=(0.2, 0.34), draught=(0.08, 0.15), transom=(0.3, 0.9))
+    hull = Hull(visible, beam=(0.2, 0.34), draught=(0.08, 0.15), transom=(0.3, 0.9))
     cloth, spar = hsv(visible, (0, 1), (0.0, 0.5), (0.75, 0.98)), wood(visible)
     parts = [hull.solid(paint), *hull.stripe(spar)]
     masts = (visible.uniform(0.0, 0.14),) if visible.random() < 0.75 else (0.2, visible.uniform(-0.2, -0.1))
@@ -152,7 +65,7 @@ def _sail(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) ->
 
 
 def _motor(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) -> list[Solid]:
-    hull = _Hull(visible, beam=(0.26, 0.42), draught=(0.1, 0.18), transom=(0.75, 1.0))
+    hull = Hull(visible, beam=(0.26, 0.42), draught=(0.1, 0.18), transom=(0.75, 1.0))
     glass = hsv(visible, (0.5, 0.65), (0.2, 0.5), (0.15, 0.4))
     parts = [hull.solid(paint), *hull.stripe(house)]
     front, rear = visible.uniform(0.08, 0.28), visible.uniform(-0.38, -0.1)
@@ -198,7 +111,7 @@ def _motor(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) -
 
 
 def _cargo(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) -> list[Solid]:
-    hull = _Hull(visible, beam=(0.14, 0.22), draught=(0.08, 0.14), transom=(0.8, 1.0))
+    hull = Hull(visible, beam=(0.14, 0.22), draught=(0.08, 0.14), transom=(0.8, 1.0))
     hull.fullness = visible.uniform(4, 9)
     parts = [hull.solid(paint)]
     aft = visible.uniform(-0.46, -0.36) if visible.random() < 0.75 else visible.uniform(-0.05, 0.28)
@@ -240,7 +153,7 @@ def _cargo(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) -
 
 def _war(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) -> list[Solid]:
     grey = hsv(visible, (0.5, 0.65), (0.03, 0.2), (0.35, 0.7))
-    hull = _Hull(visible, beam=(0.1, 0.17), draught=(0.06, 0.1), transom=(0.6, 0.9))
+    hull = Hull(visible, beam=(0.1, 0.17), draught=(0.06, 0.1), transom=(0.6, 0.9))
     parts = [hull.solid(grey)]
     base, spans = 0.0, [(visible.uniform(-0.25, -0.1), visible.uniform(0.1, 0.2))]
     spans.append((spans[0][0] + 0.12, spans[0][1] - 0.03))
@@ -276,7 +189,7 @@ def _war(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) -> 
 
 def _rowing(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) -> list[Solid]:
     """An open boat: the inside is a darker deck below the rails; thwarts, sometimes oars."""
-    hull = _Hull(visible, beam=(0.2, 0.4), draught=(0.1, 0.18), transom=(0.05, 0.8))
+    hull = Hull(visible, beam=(0.2, 0.4), draught=(0.1, 0.18), transom=(0.05, 0.8))
     parts = [hull.solid(paint * 0.8)]
     z = np.linspace(-0.5, 0.47, 12)
     path = [(hull.half_beam(at), hull.deck(at) + 0.012, at) for at in z]
@@ -300,7 +213,7 @@ def _rowing(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) 
 
 
 def _catamaran(visible: np.random.Generator, paint: np.ndarray, house: np.ndarray) -> list[Solid]:
-    hull = _Hull(visible, beam=(0.09, 0.13), draught=(0.08, 0.13), transom=(0.6, 1.0))
+    hull = Hull(visible, beam=(0.09, 0.13), draught=(0.08, 0.13), transom=(0.6, 1.0))
     apart, solid = visible.uniform(0.14, 0.22), hull.solid(paint)
     deck = box((2 * apart, 0.03, visible.uniform(0.4, 0.62)), (0, 0.0, -0.08), house * 0.9)
     cabin = loft(
