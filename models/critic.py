@@ -14,7 +14,10 @@ from models.autoencoder import LATENT_DIM
 
 
 class Critic(nn.Module):
-    """D(z): (*, LATENT_DIM) codes -> (*) scores, unbounded. No batch norm: the penalty is on single codes."""
+    """D(z): (*, LATENT_DIM) codes -> (*) scores, unbounded. No batch norm: the penalty is on single codes.
+
+    Only differences of scores mean something: what all of them have in common cancels in every loss, and drifts.
+    """
 
     def __init__(self) -> None:
         super().__init__()

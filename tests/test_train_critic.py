@@ -93,9 +93,9 @@ def test_it_tells_real_codes_from_scrambled_ones() -> None:
         return torch.take_along_dim(codes, torch.rand_like(codes).argsort(0), 0)
 
     for _ in range(200):
-        batch = Batch(torch.empty(0), torch.ones(32, 1, 1, 1), camera, _boxes(32))
+        batch = Batch(torch.empty(0), torch.ones(32, 1, 1, 1), camera, _boxes(32)[None])
         assert batch.real is not None
-        fake = scrambled(autoencoder.encode(batch.real))
+        fake = scrambled(autoencoder.encode(batch.real[0]))
         report = critic_steps(learner, fake[None], batch, torch.rand(1, 1, 32), stage)
     assert report["penalty"] < 0.2
     with torch.no_grad():
@@ -124,12 +124,12 @@ def test_the_critic_moves_the_generator_and_nothing_else(tiny_data: Path, smoke_
 
 def test_n_critic_and_the_real_pool_are_heard(tiny_data: Path, smoke_run: Path) -> None:
     split = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, progress=False)
-    stage = dataclasses.replace(_SMOKE.stage1, n_critic=3, real_pool=4)
+    stage = dataclasses.replace(_SMOKE.stage1, n_critic=3, real_pool=2)
     training = Training(dataclasses.replace(_SMOKE, stage1=stage), split)
     training.begin_phase("stage1", smoke_run)
     batch, chance = training._draw(stage)
     assert batch.real is not None
-    assert batch.real.shape == (stage.shapes + 4, 128, 3)
+    assert batch.real.shape == (3, stage.shapes, 128, 3)
     assert chance.mix.shape == (3, stage.codes, stage.shapes)
     steps = []
     training.learner.critic_optimiser.register_step_post_hook(lambda *_: steps.append(1))

@@ -140,7 +140,8 @@ class Batch(NamedTuple):
         images: (B, V, 3, h, w) in [0, 1].
         depth: (B, V, S, S) metric depth, +inf where empty.
         camera: (B, V), of the depth maps.
-        real: (B', N, 3) ground truth clouds for the critic: those of the B shapes, then others; None without one.
+        real: (K, B, N, 3) ground truth clouds for the critic, first those of the B shapes, then of others; None
+            without a critic.
     """
 
     images: Tensor

@@ -184,10 +184,10 @@ def _check_fits(config: FitConfig, train: LoadedSplit, world: World) -> None:
             f"the data have {train.views} views per shape, the configuration asks for {wanted_views}"
         )
     for stage in config.stages:
-        if stage.shapes % world.size or stage.real_pool % world.size:
+        if stage.shapes % world.size:
             raise UserError(
-                f"{world.size} processes cannot share {stage.shapes} shapes (and a real pool of "
-                f"{stage.real_pool}) equally; change --stage1.shapes, --stage2.shapes or the number of processes"
+                f"{world.size} processes cannot share {stage.shapes} shapes equally; change --stage1.shapes, "
+                "--stage2.shapes or the number of processes"
             )
 
 

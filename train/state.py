@@ -142,10 +142,8 @@ class Training:
         mix = torch.empty(0)
         if stage.gamma > 0:
             mix = torch.rand(stage.n_critic, stage.codes, images, generator=self._random)
-            real = share(self._clouds(shapes))
-            if stage.real_pool:
-                real = torch.cat([real, share(self._draw_clouds(stage.real_pool))])
-            batch = batch._replace(real=real)
+            real = [self._clouds(shapes), *(self._draw_clouds(stage.shapes) for _ in range(stage.real_pool))]
+            batch = batch._replace(real=share(torch.stack(real), 1))
         return batch, Chance(share(codes, 1), share(mix, -1))
 
     def networks(self) -> dict[str, nn.Module]:

@@ -111,17 +111,17 @@ def critic_steps(
     Args:
         learner: networks and optimisers.
         fake: (R, B*V, LATENT_DIM) codes of the predictions, without gradient.
-        batch: its `real` clouds are the truth: the B shapes, then others.
+        batch: its `real` clouds are the truth.
         mix: (n, R, B*V) in [0, 1].
         stage: the stage's settings.
         world: the group of processes that share the batch.
     """
     assert batch.real is not None
     with torch.no_grad():
-        real = learner.autoencoder.encode(batch.real)
-    # The penalty is measured between a prediction and its own shape; others of the pool take their turns.
-    views = batch.depth.shape[1]
-    partners = real[(torch.arange(fake.shape[0] * fake.shape[1]) // views) % len(real)].view_as(fake)
+        real = learner.autoencoder.encode(batch.real.flatten(0, 1)).unflatten(0, batch.real.shape[:2])
+    # The penalty is measured between a prediction and its own shape; with a pool, other slots meet other shapes.
+    slots = torch.arange(len(fake)) % len(real)
+    partners = real[slots].repeat_interleave(batch.depth.shape[1], dim=1)
     set_rate(learner.critic_optimiser, stage.critic_learning_rate)
     scores: dict[str, Tensor] = {}
     for places in mix:
