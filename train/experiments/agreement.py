@@ -244,7 +244,7 @@ def _figure(result: dict[str, Any], groups: Scores) -> Figure:
     disagreement = [ways[name]["mean"]["consistency"] for name in order]
     for column, colour in (("cd", "#1f6f8b"), ("fps_cd", "#c8553d")):
         errors = [ways[name]["mean"][column] for name in order]
-        left.plot(disagreement, errors, "o-", color=colour, label=_COLUMNS[column])
+        left.plot(disagreement, errors, "o", color=colour, label=_COLUMNS[column])
     left.axvline(result["floor"], color=figures.MUTED, ls=":", label="samples of the true shape")
     left.set(
         xlabel="consistency loss x100", ylabel="chamfer distance x100", title="Every way of choosing codes"
