@@ -47,7 +47,7 @@ def project(points: Tensor, camera: PinholeCamera) -> Projection:
     """
     _checks.check_clouds("project", "points", points)
     views = check_views("project", "camera", camera, points)
-    return Projection(*_project(points, views.projection, "project"))
+    return Projection(*_project(points, views.projection))
 
 
 def unproject(depth: Tensor, camera: PinholeCamera) -> PointSets:
@@ -71,7 +71,7 @@ def unproject(depth: Tensor, camera: PinholeCamera) -> PointSets:
         [[[[0.0, 0.0, 0.0]]]]
     """
     views = _depth_views("unproject", depth, "camera", camera)
-    return PointSets(*_unproject(depth, views.back_projection, True, "unproject"))
+    return PointSets(*_unproject(depth, views.back_projection))
 
 
 def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Reprojection:
@@ -93,24 +93,9 @@ def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Re
         [[[[[0.5, 0.5]]]]]
     """
     views = _depth_views("reproject", depth, "source", source)
-    batch, count, height, width = depth.shape
-    targets = check_views("reproject", "target", target, depth, views=count)
-    points, _ = _unproject(depth, views.back_projection, False, "reproject")
-    flat = batch * count
-    pixels, seen_depth = _project(
-        points.reshape(flat, height * width, 3), targets.projection.reshape(flat, 1, 3, 4), "reproject"
-    )
-    pixels = pixels.reshape(batch, count, height, width, 2)
-    seen_depth = seen_depth.reshape(depth.shape)
-    foreground = torch.isfinite(depth)
-    u, v = pixels[..., 0], pixels[..., 1]
-    inside = (u >= 0) & (u < target.width) & (v >= 0) & (v < target.height) & (seen_depth > 0)
-    return Reprojection(
-        points=points.reshape(batch, count, height, width, 3),
-        pixels=torch.where(foreground[..., None], pixels, torch.inf),
-        depth=torch.where(foreground, seen_depth, torch.inf),
-        valid=foreground & inside,
-    )
+    targets = check_views("reproject", "target", target, depth, views=depth.shape[1])
+    size = target.height, target.width
+    return Reprojection(*_reproject(depth, views.back_projection, targets.projection, *size))
 
 
 def _depth_views(function: str, depth: Tensor, name: str, camera: PinholeCamera) -> Views:
@@ -128,22 +113,22 @@ def _depth_views(function: str, depth: Tensor, name: str, camera: PinholeCamera)
     return check_views(function, name, camera, depth, views=count)
 
 
-def _project_fake(points: Tensor, projection: Tensor, caller: str):
+def _project_fake(points: Tensor, projection: Tensor):
     shape = (*projection.shape[:2], points.shape[1])
     return points.new_empty((*shape, 2)), points.new_empty(shape)
 
 
 def _project_setup(ctx, inputs, output) -> None:
-    ctx.save_for_backward(inputs[0], inputs[1])
+    ctx.save_for_backward(*inputs)
 
 
 def _project_gradient(ctx, grad_pixels: Tensor, grad_depth: Tensor):
     points, projection = ctx.saved_tensors
-    return *_project_backward(points, projection, grad_pixels, grad_depth), None
+    return _project_backward(points, projection, grad_pixels, grad_depth)
 
 
 @_bridge.register("project", fake=_project_fake, backward=_project_gradient, setup=_project_setup)
-def _project(points: Tensor, projection: Tensor, caller: str) -> tuple[Tensor, Tensor]:
+def _project(points: Tensor, projection: Tensor) -> tuple[Tensor, Tensor]:
     batch, views = projection.shape[:2]
     count = points.shape[1]
     pixels = points.new_empty((batch, views, count, 2))
@@ -154,7 +139,7 @@ def _project(points: Tensor, projection: Tensor, caller: str) -> tuple[Tensor, T
         outputs = pixels.view(-1), depth.view(-1), total
         _bridge.launch("reproject", "project", points.dtype, *inputs, *outputs, views, count)
     if depth.numel() == 0 or not math.isfinite(float(total.sum())):
-        _checks.check_finite(caller, "points", points)
+        _checks.check_finite("project", "points", points)
     return pixels, depth
 
 
@@ -179,7 +164,7 @@ def _project_backward(
     return grad_points, grad_projection
 
 
-def _unproject_fake(depth: Tensor, back_projection: Tensor, compact: bool, caller: str):
+def _unproject_fake(depth: Tensor, back_projection: Tensor):
     batch, views, height, width = depth.shape
     return (
         depth.new_empty((batch, views, height * width, 3)),
@@ -189,38 +174,35 @@ def _unproject_fake(depth: Tensor, back_projection: Tensor, compact: bool, calle
 
 def _unproject_setup(ctx, inputs, output) -> None:
     ctx.mark_non_differentiable(output[1])
-    ctx.save_for_backward(inputs[0], inputs[1])
-    ctx.compact = inputs[2]
+    ctx.save_for_backward(*inputs)
 
 
 def _unproject_gradient(ctx, grad_points: Tensor, _grad_lengths):
     depth, back_projection = ctx.saved_tensors
-    return *_unproject_backward(depth, back_projection, grad_points, ctx.compact), None, None
+    return _unproject_backward(depth, back_projection, grad_points)
 
 
 @_bridge.register("unproject", fake=_unproject_fake, backward=_unproject_gradient, setup=_unproject_setup)
-def _unproject(depth: Tensor, back_projection: Tensor, compact: bool, caller: str) -> tuple[Tensor, Tensor]:
+def _unproject(depth: Tensor, back_projection: Tensor) -> tuple[Tensor, Tensor]:
     batch, views, height, width = depth.shape
-    check_depth(caller, "depth", depth)
+    check_depth("unproject", "depth", depth)
     points = depth.new_zeros((batch * views, height * width, 3))
     lengths = torch.zeros(batch * views, dtype=torch.int64)
     if depth.numel():
         maps = depth.reshape(batch * views, height, width)
         matrices = back_projection.reshape(batch * views, 12)
-        _bridge.launch("reproject", "unproject", depth.dtype, maps, matrices, points, lengths, int(compact))
+        _bridge.launch("reproject", "unproject", depth.dtype, maps, matrices, points, lengths)
     return points.view(batch, views, height * width, 3), lengths.view(batch, views)
 
 
 @_bridge.register(
     "unproject_backward",
-    fake=lambda depth, back_projection, grad_points, compact: (
+    fake=lambda depth, back_projection, grad_points: (
         depth.new_empty(depth.shape),
         back_projection.new_empty(back_projection.shape),
     ),
 )
-def _unproject_backward(
-    depth: Tensor, back_projection: Tensor, grad_points: Tensor, compact: bool
-) -> tuple[Tensor, Tensor]:
+def _unproject_backward(depth: Tensor, back_projection: Tensor, grad_points: Tensor) -> tuple[Tensor, Tensor]:
     batch, views, height, width = depth.shape
     flat = batch * views
     grad_depth = depth.new_zeros((flat, height, width))
@@ -235,9 +217,74 @@ def _unproject_backward(
             grad_points.reshape(flat, height * width, 3),
             grad_depth,
             grad_back_projection,
-            int(compact),
         )
     return grad_depth.view(depth.shape), grad_back_projection.view(back_projection.shape)
+
+
+def _reproject_fake(depth: Tensor, back_projection: Tensor, projection: Tensor, height: int, width: int):
+    return (
+        depth.new_empty((*depth.shape, 3)),
+        depth.new_empty((*depth.shape, 2)),
+        depth.new_empty(depth.shape),
+        depth.new_empty(depth.shape, dtype=torch.bool),
+    )
+
+
+def _reproject_setup(ctx, inputs, output) -> None:
+    ctx.mark_non_differentiable(output[3])
+    ctx.save_for_backward(*inputs[:3])
+
+
+def _reproject_gradient(ctx, grad_points: Tensor, grad_pixels: Tensor, grad_seen: Tensor, _grad_valid):
+    depth, back_projection, projection = ctx.saved_tensors
+    gradients = _reproject_backward(depth, back_projection, projection, grad_points, grad_pixels, grad_seen)
+    return *gradients, None, None
+
+
+@_bridge.register("reproject", fake=_reproject_fake, backward=_reproject_gradient, setup=_reproject_setup)
+def _reproject(
+    depth: Tensor, back_projection: Tensor, projection: Tensor, height: int, width: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    check_depth("reproject", "depth", depth)
+    batch, views, rows, columns = depth.shape
+    points = depth.new_empty((*depth.shape, 3))
+    pixels = depth.new_empty((*depth.shape, 2))
+    seen = depth.new_empty(depth.shape)
+    valid = torch.empty(depth.shape, dtype=torch.uint8)
+    if depth.numel():
+        total = depth.new_empty(batch * views)
+        inputs = depth.reshape(-1), back_projection.reshape(-1), projection.reshape(-1)
+        outputs = points.view(-1), pixels.view(-1), seen.view(-1), valid.view(-1), total
+        sizes = rows, columns, height, width
+        _bridge.launch("reproject", "reproject", depth.dtype, *inputs, *outputs, *sizes)
+        if not math.isfinite(float(total.sum())):
+            _checks.check_finite("reproject", "points", points)
+    return points, pixels, seen, valid.view(torch.bool)
+
+
+@_bridge.register(
+    "reproject_backward",
+    fake=lambda depth, back_projection, projection, *_: (
+        depth.new_empty(depth.shape),
+        back_projection.new_empty(back_projection.shape),
+        projection.new_empty(projection.shape),
+    ),
+)
+def _reproject_backward(
+    depth: Tensor,
+    back_projection: Tensor,
+    projection: Tensor,
+    grad_points: Tensor,
+    grad_pixels: Tensor,
+    grad_seen: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    inputs = depth, back_projection, projection
+    grad_depth, grad_back_projection, grad_projection = (x.new_empty(x.shape) for x in inputs)
+    if depth.numel():
+        gradients = grad_depth, grad_back_projection, grad_projection
+        flat = [x.reshape(-1) for x in (*inputs, grad_points, grad_pixels, grad_seen, *gradients)]
+        _bridge.launch("reproject", "reproject_backward", depth.dtype, *flat, *depth.shape[2:])
+    return grad_depth, grad_back_projection, grad_projection
 
 
 def check_depth(function: str, name: str, depth: Tensor) -> None:

@@ -13,6 +13,7 @@ def build(real):
     matrices2 = ti.types.ndarray(dtype=real, ndim=2)
     integers = ti.types.ndarray(dtype=ti.i64, ndim=1)
     reals = ti.types.ndarray(dtype=real, ndim=1)
+    flags = ti.types.ndarray(dtype=ti.u8, ndim=1)
 
     @ti.kernel
     def project(
@@ -146,10 +147,9 @@ def build(real):
         back_projection: matrices2,
         points: points3,
         lengths: integers,
-        compact: ti.i32,
         spread: ti.i32,
     ):
-        """Pixel centres at their depth. With `compact` the foreground comes first; else every pixel keeps its place."""
+        """Pixel centres at their depth, the foreground only, one behind the other."""
         for step in range(depth.shape[0] * spread):
             if step % spread == 0:
                 view = step // spread
@@ -159,11 +159,10 @@ def build(real):
                     v = ti.cast(row, real) + real(0.5)
                     for column in range(depth.shape[2]):
                         d = depth[view, row, column]
-                        slot = ti.select(compact != 0, count, row * depth.shape[2] + column)
                         if d < ti.math.inf:
                             u = ti.cast(column, real) + real(0.5)
                             for k in ti.static(range(3)):
-                                points[view, slot, k] = (
+                                points[view, count, k] = (
                                     d * (m[4 * k] * u + m[4 * k + 1] * v + m[4 * k + 2]) + m[4 * k + 3]
                                 )
                             count += 1
@@ -176,7 +175,6 @@ def build(real):
         grad_points: points3,
         grad_depth: maps3,
         grad_back_projection: matrices2,
-        compact: ti.i32,
         spread: ti.i32,
     ):
         for step in range(depth.shape[0] * spread):
@@ -189,12 +187,11 @@ def build(real):
                     v = ti.cast(row, real) + real(0.5)
                     for column in range(depth.shape[2]):
                         d = depth[view, row, column]
-                        slot = ti.select(compact != 0, count, row * depth.shape[2] + column)
                         g_depth = real(0.0)
                         if d < ti.math.inf:
                             u = ti.cast(column, real) + real(0.5)
                             for k in ti.static(range(3)):
-                                g = grad_points[view, slot, k]
+                                g = grad_points[view, count, k]
                                 g_depth += g * (m[4 * k] * u + m[4 * k + 1] * v + m[4 * k + 2])
                                 total[4 * k] += g * d * u
                                 total[4 * k + 1] += g * d * v
@@ -205,9 +202,130 @@ def build(real):
                 for e in ti.static(range(12)):
                     grad_back_projection[view, e] = total[e]
 
+    @ti.func
+    def pixel_to_world(m: ti.template(), u, v):
+        """The world point at a pixel is its depth times this direction, plus the optical centre m[3], m[7], m[11]."""
+        return ti.Vector([m[4 * k] * u + m[4 * k + 1] * v + m[4 * k + 2] for k in ti.static(range(3))])
+
+    @ti.kernel
+    def reproject(
+        depth: reals,
+        back_projection: reals,
+        projection: reals,
+        points: reals,
+        pixels: reals,
+        seen: reals,
+        valid: flags,
+        total: reals,
+        height: ti.i32,
+        width: ti.i32,
+        target_height: ti.i32,
+        target_width: ti.i32,
+        spread: ti.i32,
+    ):
+        """Unproject and project in one pass over a map. `total` receives the sum of its points' coordinates."""
+        for step in range(total.shape[0] * spread):
+            if step % spread == 0:
+                view = step // spread
+                b = ti.Vector([back_projection[view * 12 + e] for e in ti.static(range(12))])
+                m = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
+                rows = ti.cast(target_height, real)
+                columns = ti.cast(target_width, real)
+                sum_of_coordinates = real(0.0)
+                for row in range(height):
+                    for column in range(width):
+                        at = (view * height + row) * width + column
+                        d = depth[at]
+                        x = ti.Vector([real(0.0) for _ in ti.static(range(3))])
+                        u = real(ti.math.inf)
+                        v = real(ti.math.inf)
+                        w = real(ti.math.inf)
+                        inside = False
+                        if d < ti.math.inf:
+                            ray = pixel_to_world(
+                                b, ti.cast(column, real) + real(0.5), ti.cast(row, real) + real(0.5)
+                            )
+                            for k in ti.static(range(3)):
+                                x[k] = d * ray[k] + b[4 * k + 3]
+                            sum_of_coordinates += x[0] + x[1] + x[2]
+                            w = m[8] * x[0] + m[9] * x[1] + m[10] * x[2] + m[11]
+                            if w > real(0.0):
+                                inverse = real(1.0) / w
+                                u = (m[0] * x[0] + m[1] * x[1] + m[2] * x[2] + m[3]) * inverse
+                                v = (m[4] * x[0] + m[5] * x[1] + m[6] * x[2] + m[7]) * inverse
+                                inside = (u >= real(0.0)) & (u < columns) & (v >= real(0.0)) & (v < rows)
+                        for k in ti.static(range(3)):
+                            points[3 * at + k] = x[k]
+                        pixels[2 * at] = u
+                        pixels[2 * at + 1] = v
+                        seen[at] = w
+                        valid[at] = ti.cast(inside, ti.u8)
+                total[view] = sum_of_coordinates
+
+    @ti.kernel
+    def reproject_backward(
+        depth: reals,
+        back_projection: reals,
+        projection: reals,
+        grad_points: reals,
+        grad_pixels: reals,
+        grad_seen: reals,
+        grad_depth: reals,
+        grad_back_projection: reals,
+        grad_projection: reals,
+        height: ti.i32,
+        width: ti.i32,
+        spread: ti.i32,
+    ):
+        for step in range(projection.shape[0] // 12 * spread):
+            if step % spread == 0:
+                view = step // spread
+                b = ti.Vector([back_projection[view * 12 + e] for e in ti.static(range(12))])
+                m = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
+                total_b = ti.Vector([real(0.0) for _ in ti.static(range(12))])
+                total_m = ti.Vector([real(0.0) for _ in ti.static(range(12))])
+                for row in range(height):
+                    v = ti.cast(row, real) + real(0.5)
+                    for column in range(width):
+                        at = (view * height + row) * width + column
+                        d = depth[at]
+                        g_depth = real(0.0)
+                        if d < ti.math.inf:
+                            u = ti.cast(column, real) + real(0.5)
+                            ray = pixel_to_world(b, u, v)
+                            x = ti.Vector([d * ray[k] + b[4 * k + 3] for k in ti.static(range(3))])
+                            g0, g1, g2 = pull_back(
+                                m,
+                                x[0],
+                                x[1],
+                                x[2],
+                                grad_pixels[2 * at],
+                                grad_pixels[2 * at + 1],
+                                grad_seen[at],
+                            )
+                            for k in ti.static(range(3)):
+                                total_m[k] += g0 * x[k]
+                                total_m[4 + k] += g1 * x[k]
+                                total_m[8 + k] += g2 * x[k]
+                                g = grad_points[3 * at + k] + g0 * m[k] + g1 * m[4 + k] + g2 * m[8 + k]
+                                g_depth += g * ray[k]
+                                total_b[4 * k] += g * d * u
+                                total_b[4 * k + 1] += g * d * v
+                                total_b[4 * k + 2] += g * d
+                                total_b[4 * k + 3] += g
+                            total_m[3] += g0
+                            total_m[7] += g1
+                            total_m[11] += g2
+                        grad_depth[at] = g_depth
+                for e in ti.static(range(12)):
+                    grad_back_projection[view * 12 + e] = total_b[e]
+                    grad_projection[view * 12 + e] = total_m[e]
+
     return SimpleNamespace(
         project=project,
         project_backward=project_backward,
         unproject=unproject,
         unproject_backward=unproject_backward,
+        reproject=reproject,
+        reproject_backward=reproject_backward,
     )
