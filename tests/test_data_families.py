@@ -5,12 +5,15 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial import KDTree
 
+from train.__main__ import main
 from train.data.families import AMBIGUOUS, FAMILIES, MODES, Cone
-from train.data.procedural import ambiguity, variants_of
+from train.data.portraits import draw_families
+from train.data.procedural import ambiguity, generate, variants_of
 from train.data.render import MAX_RADIUS, Renderer, orbit_camera
-from train.data.rules import measure
+from train.data.rules import measure, measure_tree
 from train.data.solids import (
     bar,
     body,
@@ -88,16 +91,50 @@ def test_rules_are_measured_and_broken_ones_are_named(monkeypatch):
     report = measure(["display", "car"], objects=1, seed=4, processes=1)
     assert report.broken == []
     assert "all rules hold" in report.summary()
-    assert [list(figures) for figures in report.figures.values()] == [[4], [4]]
+    assert {name: list(figures) for name, figures in report.figures.items()} == {
+        "display": ["display 4"],
+        "car": ["car 4"],
+    }
     same = variants_of("display", 0)[:1] * MODES
     monkeypatch.setattr("train.data.rules.variants_of", lambda *_: same)
     report = measure(["display"], objects=1, processes=1)
     assert len(report.broken) == 1
     assert "display 0: front 0.00%, back 0%" in report.summary()
+    assert main(["data", "rules", "--categories", "display", "--objects", "1"]) == 1
     with pytest.raises(UserError, match=r"called lamp; there are: chair"):
         measure(["lamp"])
     with pytest.raises(UserError, match="objects must be"):
         measure(objects=0)
+
+
+def test_the_rules_are_measured_on_the_objects_of_a_dataset(tmp_path):
+    for name, categories in (("data", ["lamp", "cabinet"]), ("lamps", ["lamp"])):
+        generate(
+            tmp_path / name,
+            shapes=2,
+            categories=categories,
+            seed=7,
+            size=32,
+            views=1,
+            processes=1,
+            variants=2,
+        )
+    report = measure_tree(tmp_path / "data", processes=1)
+    assert {name: list(figures) for name, figures in report.figures.items()} == {
+        "cabinet": ["cabinet_s7_000001"]
+    }
+    assert report.broken == []
+    with pytest.raises(UserError, match="no procedural object"):
+        measure_tree(tmp_path / "lamps")
+
+
+def test_pictures_of_families_are_small_and_show_every_variant(tmp_path):
+    paths = draw_families(tmp_path, ["display", "bench"], objects=1)
+    assert [path.name for path in paths] == ["display.png", "bench.png"]
+    for path, views in zip(paths, (1 + 3 * MODES, 10), strict=True):
+        assert path.stat().st_size < 150_000
+        picture = np.asarray(Image.open(path).convert("RGB"))
+        assert picture.shape[1] // 130 == views
 
 
 @pytest.mark.parametrize("category", AMBIGUOUS)

@@ -138,19 +138,30 @@ class Show:
 
 @dataclasses.dataclass
 class Rules:
-    """Measure on fresh objects whether the fronts of the families hide their backs; see docs/families.md."""
+    """Measure whether the fronts of the families hide their backs; see docs/families.md."""
 
+    data: Path | None = None
+    """Measure every object of this procedural data tree, not fresh ones."""
     categories: tuple[str, ...] = ()
     """Families to measure; none means all that have designed ambiguity."""
     objects: int = 20
     """Objects of each family."""
     seed: int = 0
     """Draws the objects."""
+    pictures: Path | None = None
+    """Folder for a picture of each family, front and backs; of all thirteen if no categories are given."""
 
     def run(self) -> int:
-        from train.data.rules import measure
+        from train.data.families import FAMILIES
+        from train.data.portraits import draw_families
+        from train.data.rules import measure, measure_tree
 
-        report = measure(self.categories or None, objects=self.objects, seed=self.seed)
+        if self.pictures is not None:
+            draw_families(self.pictures, self.categories or tuple(FAMILIES), seed=self.seed)
+        if self.data is not None:
+            report = measure_tree(self.data)
+        else:
+            report = measure(self.categories or None, objects=self.objects, seed=self.seed)
         print(report.summary())
         return 1 if report.broken else 0
 
