@@ -255,7 +255,8 @@ PROFILES: dict[str, FitConfig] = {
         checkpoint_every=1_000, health_every=500, health_patience=8_000, picture_every=5_000,
     ),
     # The paper's 30 steps of 0.5 make the views of a network this small agree at the expense of coverage: CD + 0.29,
-    # FPS-CD - 0.05 against random codes at 8 views. 10 of 0.1: + 0.02 and - 0.11 (docs/results.md).
+    # FPS-CD - 0.05 against random codes at 8 views. 10 of 0.1: + 0.02 and - 0.11, on other shapes + 0.08
+    # and - 0.05 (docs/results.md).
     "cpu": FitConfig(
         _CPU_STAGE1, _CPU_STAGE2, _CPU_PRETRAIN, "cpu", inference=InferenceConfig(steps=10, step_size=0.1)
     ),
