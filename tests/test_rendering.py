@@ -38,7 +38,7 @@ def gradients(outputs: Tensor | tuple[Tensor, ...], inputs: list[Tensor], seed: 
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("radius", [0.0, 0.5, 1.7])
+@pytest.mark.parametrize("radius", [0.0, 0.5, 1.0, 1.7])
 @pytest.mark.parametrize("lengths", [None, (60, 23), (0, 60)])
 def test_splat_equals_its_twin(dtype, radius, lengths):
     camera = cameras(dtype)

@@ -96,6 +96,31 @@ def build(real):
                 column = ti.select(ends, left, column + 1)
 
     @ti.func
+    def cover_four(depth: ti.template(), index: ti.template(), start, i, u, v, d, size, radius):
+        """`cover_disc` away from the map's edge, for a radius of at most 1: the own pixel, and on the nearer side of it
+        one of its row, one of its column and one across. Without a loop, whose branches would be missed."""
+        half = real(0.5)
+        column = ti.cast(u, ti.i32)
+        row = ti.cast(v, ti.i32)
+        beside = ti.select(u - ti.cast(column, real) < half, -1, 1)
+        above = ti.select(v - ti.cast(row, real) < half, -1, 1)
+        width = ti.cast(size[1], ti.i32)
+        for k in ti.static(range(4)):
+            c = column + beside * (k % 2)
+            r = row + above * (k // 2)
+            du = ti.cast(c, real) + half - u
+            dv = ti.cast(r, real) + half - v
+            # Out of reach, it competes for its own pixel again, in vain: one select less, hence no branch.
+            reached = du * du + dv * dv <= radius * radius
+            offset = above * (k // 2) * width + beside * (k % 2)
+            p = start[0] + row * width + column + ti.select(reached, offset, 0)
+            before = depth[p]
+            owner = ti.cast(index[p], ti.i32)
+            wins = d < before
+            depth[p] = ti.select(wins, d, before)
+            index[p] = ti.select(wins, i, owner)
+
+    @ti.func
     def mark_owners(index: ti.template(), visible: ti.template(), start, pixels):
         """Without a branch: an empty pixel marks point 0, whose own flag is put right afterwards."""
         owned = ti.u8(0)
@@ -168,7 +193,15 @@ def build(real):
                         )
                         rest += d
                         if ti.static(disc):
-                            cover_disc(depth, index, start, i, u, v, d, size, radius)
+                            inner = (u >= real(1.0)) & (u < size[1] - real(1.0))
+                            inner = inner & (v >= real(1.0)) & (v < size[0] - real(1.0)) & (d > real(0.0))
+                            # A point in the middle of its pixel may be equally near to both sides.
+                            inner = inner & (u - real(0.5) != ti.cast(ti.cast(u, ti.i32), real))
+                            inner = inner & (v - real(0.5) != ti.cast(ti.cast(v, ti.i32), real))
+                            if inner & (radius <= real(1.0)):
+                                cover_four(depth, index, start, i, u, v, d, size, radius)
+                            else:
+                                cover_disc(depth, index, start, i, u, v, d, size, radius)
                         else:
                             cover_one(depth, index, visible, start, i, u, v, d, size)
                     total[at] = rest
