@@ -6,6 +6,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -131,17 +133,73 @@ def test_sigterm_saves_at_once_and_leaves(
     _assert_same_run(tmp_path / "run", smoke_run)
 
 
-@pytest.mark.slow
-def test_sigkill_loses_nothing_but_time(tiny_data: Path, smoke_run: Path, tmp_path: Path) -> None:
+_CLI = (
+    "import resource, sys; limit = int(sys.argv.pop(1)); "
+    "limit and resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)); "
+    "from train.__main__ import main; sys.exit(main(sys.argv[1:]))"
+)
+
+
+def _fit_command(data: Path, run: Path, *options: str, largest_file: int = 0) -> list[str]:
+    fit = ["fit", "--data", str(data), "--out", str(run), "--profile", "smoke", *options]
+    return [sys.executable, "-c", _CLI, str(largest_file), *fit]
+
+
+def test_a_full_disk_leaves_the_last_good_checkpoint(
+    tiny_data: Path, smoke_run: Path, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
-    command = [sys.executable, "-m", "train", "fit", "--data", str(tiny_data), "--out", str(run)]
-    command += ["--profile", "smoke"]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    while latest_checkpoint(run) is None and process.poll() is None:
-        time.sleep(0.02)
-    process.kill()
-    process.wait()
-    subprocess.run([*command, "--resume"], check=True, stderr=subprocess.DEVNULL)
+    shutil.copytree(smoke_run, run)
+    shutil.rmtree(run / "checkpoints" / "step-00000070")
+    before = {p: p.read_bytes() for p in (run / "checkpoints").rglob("*") if p.is_file() and "step" in str(p)}
+    command = _fit_command(
+        tiny_data, run, "--resume", largest_file=4_000_000
+    )  # the optimiser's state is larger
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 2
+    complaint = done.stderr.splitlines()[-1]
+    assert "step-00000070 cannot be written ([Errno 27] File too large)" in complaint
+    assert "continue with --resume" in complaint
+    after = {p: p.read_bytes() for p in (run / "checkpoints").rglob("*") if p.is_file() and "step" in str(p)}
+    assert after == before
+    assert fit(tiny_data, run, _SMOKE, resume=True, progress=False)
+    _assert_same_run(run, smoke_run)
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_it_serves(
+    tiny_data: Path, smoke_run: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(smoke_run, run)
+    newest = run / "checkpoints" / "step-00000070"
+    (newest / "critic.safetensors").write_bytes(b"half")
+    with pytest.raises(
+        UserError, match=r"critic\.safetensors cannot be read .*; delete .*step-00000070 to resume"
+    ):
+        fit(tiny_data, run, _SMOKE, resume=True, progress=False)
+    shutil.rmtree(newest)
+    assert fit(tiny_data, run, _SMOKE, resume=True, progress=False)
+    _assert_same_run(run, smoke_run)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moments", [(20, 50, 70), "random", "random"], ids=["borders", "random", "again"])
+def test_sigkill_loses_nothing_but_time(
+    moments: tuple[int, ...] | str, tiny_data: Path, smoke_run: Path, tmp_path: Path
+) -> None:
+    """Killed three times, each as soon as so many steps are on record; at 20 and 50 a phase has just ended."""
+    if isinstance(moments, str):
+        moments = tuple(sorted(random.sample(range(1, 71), 3)))
+    print("killed at", moments)  # pytest shows it if the test fails
+    run = tmp_path / "run"
+    for moment in moments:
+        resume = ["--resume"] if (run / "config.json").exists() else []
+        process = subprocess.Popen(_fit_command(tiny_data, run, *resume), stderr=subprocess.DEVNULL)
+        while process.poll() is None and len(read_metrics(run)) < moment:
+            time.sleep(0.005)
+        process.kill()
+        process.wait()
+    subprocess.run(_fit_command(tiny_data, run, "--resume"), check=True, stderr=subprocess.DEVNULL)
     _assert_same_run(run, smoke_run)
 
 

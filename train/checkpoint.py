@@ -10,6 +10,7 @@ generator's is called weights.safetensors.
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -144,20 +145,21 @@ def save_checkpoint(
         directory.mkdir()
         for name, network in networks.items():
             save_weights(network, directory / f"{name}.safetensors")
-        torch.save(state, directory / "state.pt")
+        buffer = io.BytesIO()  # torch's own writer answers a full disk with a riddle
+        torch.save(state, buffer)
+        (directory / "state.pt").write_bytes(buffer.getbuffer())
     for old in _checkpoints(run)[:-keep]:
         remove(old)
 
 
 @contextmanager
 def _space_for(target: Path) -> Iterator[None]:
-    """Turns a failed write, which torch and safetensors report in their own ways, into words."""
+    """Turns a failed write into words; those inside are left as they are."""
     try:
         yield
-    except (OSError, SafetensorError, RuntimeError) as error:
-        reason = str(error).strip().splitlines()[0]
+    except (OSError, SafetensorError) as error:
         raise UserError(
-            f"{target} cannot be written ({reason}); what was saved before is untouched: make room and continue "
+            f"{target} cannot be written ({error}); what was saved before is untouched: make room and continue "
             "with --resume"
         ) from error
 
