@@ -117,8 +117,7 @@ def critic_steps(
         world: the group of processes that share the batch.
     """
     assert batch.real is not None
-    with torch.no_grad():
-        real = learner.autoencoder.encode(batch.real.flatten(0, 1)).unflatten(0, batch.real.shape[:2])
+    real = _latents(learner, batch.real)
     # The penalty is measured between a prediction and its own shape; with a pool, other slots meet other shapes.
     slots = torch.arange(len(fake)) % len(real)
     partners = real[slots].repeat_interleave(batch.depth.shape[1], dim=1)
@@ -161,7 +160,7 @@ def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
 
 
 def _latents(learner: Learner, clouds: Tensor) -> Tensor:
-    """(R, B*V, N, 3) -> (R, B*V, LATENT_DIM), with gradient to the clouds."""
+    """(R, B, N, 3) -> (R, B, LATENT_DIM), with gradient to the clouds."""
     return learner.autoencoder.encode_frozen(clouds.flatten(0, 1)).unflatten(0, clouds.shape[:2])
 
 
