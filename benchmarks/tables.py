@@ -81,7 +81,7 @@ def short_table(rows: Rows) -> str:
         cells = []
         for direction in ("forward", "forward + backward"):
             race = [r for r in rows if (r["op"], r["size"], r["direction"]) == (op, size, direction)]
-            peers = [r for r in race[1:] if not r["remark"].startswith("approximates")]
+            peers = [r for r in race[1:] if not r["remark"].startswith(("approximates", "depth only"))]
             best = min(peers, key=lambda r: r["ms"], default=None)
             own = f"{race[0]['ms']:.3g}" if race else ""
             cells += [own, f"{best['times_ours']:.1f}x {best['contender']}" if best else ""]

@@ -1,5 +1,6 @@
 """The runtime in fresh processes: silent, lazy, polite to a host program's Taichi, clear after a fork."""
 
+import json
 import os
 import subprocess
 import sys
@@ -191,21 +192,17 @@ def test_four_python_threads_at_once():
     assert printed(code) == "True"
 
 
+@pytest.mark.timeout(900)  # where nothing is cached, every kernel is compiled
 def test_one_thread_and_two_give_the_same_bits():
-    code = """
-        import hashlib, sys
-        dp.configure(threads=THREADS)
-        g = torch.Generator().manual_seed(0)
-        a = (torch.rand(5, 300, 3, generator=g) - 0.5).requires_grad_()
-        b = (torch.rand(5, 400, 3, generator=g) - 0.5).requires_grad_()
-        camera = dp.PinholeCamera.look_at(torch.tensor([[0.0, 0, -2], [2, 0, 0]]), focal_px=40.0, height=20, width=20)
-        depth = dp.splat_depth(b.detach(), camera, radius=1.0).depth
-        terms = [dp.front_constraint(a, camera, depth, distance=d) for d in ("chamfer", "emd")]
-        terms += [dp.projection_loss(a, camera, depth), dp.earth_mover_distance(a, b).cost.sum()]
-        terms += [dp.consistency_loss(torch.stack((a, a + 0.1, a - 0.1), 1))]
-        total = sum(terms)
-        total.backward()
-        bits = [t.detach() for t in terms] + [a.grad, b.grad, dp.farthest_point_sample(a, 50), depth]
-        print(hashlib.sha256(b"".join(t.numpy().tobytes() for t in bits)).hexdigest())
-    """
-    assert printed(code.replace("THREADS", "1")) == printed(code.replace("THREADS", "2"))
+    """Of every op, forward and backward; each process also runs every op twice."""
+    script = Path(__file__).parent / "same_bits.py"
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    digests = []
+    for threads in ("1", "2"):
+        command = [sys.executable, "-W", "ignore::DeprecationWarning", str(script), threads]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=450, env=environment)
+        assert done.returncode == 0, done.stderr
+        digests.append(json.loads(done.stdout))
+    assert digests[0] == digests[1]
+    functions = {name for name in diffpoint.__all__ if name[0].islower()} - {"configure", "runtime_info"}
+    assert set(digests[0]) == functions

@@ -1,0 +1,154 @@
+"""`python tests/same_bits.py THREADS`: a digest of what every op gives, forward and backward, on so many threads.
+
+`test_runtime.py` compares the digests of processes with one thread and with two.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Iterable
+
+import torch
+from torch import Tensor
+
+import diffpoint as dp
+from diffpoint.visibility import METHODS
+
+CAMERAS = dp.PinholeCamera.look_at(
+    torch.tensor([[0.0, 0, -2], [2, 0.3, 0]]), focal_px=60.0, height=29, width=31
+)
+OTHERS = dp.PinholeCamera.look_at(
+    torch.tensor([[0.3, 0.2, -2], [2, -0.3, 0.4]]), focal_px=55.0, height=29, width=31
+)
+
+
+def clouds(count: int, points: int, seed: int) -> Tensor:
+    """(count, points, 3), some of the points twice: ties must not depend on threads either."""
+    random = torch.Generator().manual_seed(seed)
+    cloud = torch.rand(count, points, 3, generator=random) - 0.5
+    cloud[:, points // 2 : points // 2 + points // 8] = cloud[:, : points // 8]
+    return cloud
+
+
+def leaf_cameras(cameras: dp.PinholeCamera) -> dp.PinholeCamera:
+    K, extrinsics = (m.clone().requires_grad_() for m in (cameras.K, cameras.cam_from_world))
+    return dp.PinholeCamera(K, extrinsics, cameras.height, cameras.width)
+
+
+def splatted(count: int, size: int) -> list[Tensor]:
+    out = []
+    for radius in (0.0, 1.7):
+        points, cameras = clouds(count, size, 3).requires_grad_(), leaf_cameras(CAMERAS)
+        depth, index, visible = dp.splat_depth(points, cameras, radius=radius)
+        out += [index, visible, *with_gradients((points, cameras.K, cameras.cam_from_world), depth)]
+    return out
+
+
+def maps() -> tuple[Tensor, dp.PinholeCamera]:
+    cameras = leaf_cameras(CAMERAS)
+    return dp.splat_depth(clouds(3, 500, 9), CAMERAS, radius=1.0).depth.requires_grad_(), cameras
+
+
+def with_gradients(leaves: Iterable[Tensor], *outputs: Tensor) -> list[Tensor]:
+    leaves = list(leaves)
+    total = torch.stack([torch.where(torch.isfinite(o), o, 0.0).square().sum() for o in outputs]).sum()
+    return [*outputs, *torch.autograd.grad(total, leaves)]
+
+
+def unprojected() -> list[Tensor]:
+    depth, cameras = maps()
+    points, lengths = dp.unproject(depth, cameras)
+    return [lengths, *with_gradients((depth, cameras.K, cameras.cam_from_world), points)]
+
+
+def reprojected() -> list[Tensor]:
+    depth, cameras = maps()
+    targets = leaf_cameras(OTHERS)
+    seen = dp.reproject(depth, cameras, targets)
+    leaves = depth, cameras.K, cameras.cam_from_world, targets.K, targets.cam_from_world
+    return [seen.valid, *with_gradients(leaves, seen.points, seen.pixels, seen.depth)]
+
+
+def projected() -> list[Tensor]:
+    points, cameras = clouds(3, 700, 1).requires_grad_(), leaf_cameras(CAMERAS)
+    return with_gradients((points, cameras.K, cameras.cam_from_world), *dp.project(points, cameras))
+
+
+def both(function: Callable[[Tensor, Tensor], Iterable[Tensor]], count: int, n: int, m: int) -> list[Tensor]:
+    a, b = clouds(count, n, 1).requires_grad_(), clouds(count, m, 2).requires_grad_()
+    return with_gradients((a, b), *function(a, b))
+
+
+def alone(function: Callable[[Tensor], Iterable[Tensor]], count: int, n: int) -> list[Tensor]:
+    a = clouds(count, n, 3).requires_grad_()
+    return with_gradients((a,), *function(a))
+
+
+def loss(function: Callable[[Tensor, Tensor], Tensor]) -> list[Tensor]:
+    points, depth = clouds(3, 600, 4).requires_grad_(), maps()[0]
+    return with_gradients((points, depth), function(points, depth))
+
+
+def diversity() -> list[Tensor]:
+    codes = torch.randn(3, 4, 5, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    shapes = clouds(12, 150, 5).view(3, 4, 150, 3).requires_grad_()
+    return with_gradients((codes, shapes), dp.diversity_loss(codes, shapes, alpha=1.0, reduction="none"))
+
+
+# Small batches, batches, and single clouds beyond the sizes from which boxes are passed over.
+OPS: dict[str, Callable[[], list[Tensor]]] = {
+    "nearest": lambda: [
+        t
+        for sizes in ((5, 300, 400), (2, 3000, 3100))
+        for t in both(lambda a, b: dp.nearest(a, b)[:1], *sizes)
+    ],
+    "chamfer_distance": lambda: [
+        t
+        for sizes in ((1, 900, 700), (5, 300, 400), (2, 3000, 3100))
+        for t in both(lambda a, b: dp.chamfer_distance(a, b, squared=False), *sizes)
+    ],
+    "earth_mover_distance": lambda: [
+        t
+        for sizes in ((1, 600, 600), (5, 300, 400))
+        for t in both(lambda a, b: (dp.earth_mover_distance(a, b).cost,), *sizes)
+    ],
+    "approxmatch": lambda: both(lambda a, b: (dp.approxmatch(a, b),), 5, 300, 400),
+    "farthest_point_sample": lambda: [
+        dp.farthest_point_sample(clouds(*size, 6), 60) for size in ((5, 300), (1, 3000), (2, 9000))
+    ],
+    "splat_depth": lambda: [t for size in ((5, 300), (1, 40_000)) for t in splatted(*size)],
+    "sample_view": lambda: alone(lambda x: (dp.sample_view(x, dp.splat_depth(x, CAMERAS)).points,), 5, 300),
+    "visible_points": lambda: [
+        dp.visible_points(clouds(*size, 7), CAMERAS, method=method)
+        for method in METHODS
+        for size in ((5, 300), (1, 5000))
+    ],
+    "project": projected,
+    "unproject": unprojected,
+    "reproject": reprojected,
+    "front_constraint": lambda: [
+        *loss(lambda x, depth: dp.front_constraint(x, CAMERAS, depth, distance="chamfer")),
+        *loss(lambda x, depth: dp.front_constraint(x, CAMERAS, depth, distance="emd", visibility="horizon")),
+    ],
+    "front_sets": lambda: [*dp.front_sets(clouds(3, 600, 4), CAMERAS, maps()[0].detach())],
+    "projection_loss": lambda: loss(lambda x, depth: dp.projection_loss(x, CAMERAS, depth)),
+    "diversity_loss": diversity,
+    "consistency_loss": lambda: alone(lambda x: (dp.consistency_loss(x[None]),), 5, 300),
+}
+
+
+def digest(tensors: Iterable[Tensor]) -> str:
+    return hashlib.sha256(b"".join(t.detach().contiguous().numpy().tobytes() for t in tensors)).hexdigest()
+
+
+def main(threads: int) -> None:
+    dp.configure(threads=threads)
+    digests = {name: digest(op()) for name, op in OPS.items()}
+    assert digests == {name: digest(op()) for name, op in OPS.items()}, "a second run gives other bits"
+    print(json.dumps(digests))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))
