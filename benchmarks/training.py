@@ -146,7 +146,9 @@ def twins(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
     ) -> dp.Transport:
         del tolerance  # the twin is exact
         cost, assignment = reference.earth_mover_distance(a, b, **lengths)
-        return dp.Transport(cost, assignment, torch.zeros_like(cost), torch.ones_like(cost, dtype=torch.bool))
+        prices = a.new_zeros((*cost.shape, max(a.shape[-2], b.shape[-2])))
+        converged = torch.ones_like(cost, dtype=torch.bool)
+        return dp.Transport(cost, assignment, torch.zeros_like(cost), converged, prices)
 
     replacements = [visible_points, sample_view, unproject, chamfer_distance, earth_mover_distance]
     with contextlib.ExitStack() as stack:

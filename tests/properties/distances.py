@@ -82,7 +82,7 @@ def check_earth_mover_distance(recipes: tuple[throw.Recipe, throw.Recipe]) -> st
     if result is None:
         return REFUSED
     assert_finite_gradients(result.cost, a.points, b.points)
-    x, y, cost, assignment, bound, converged = (
+    x, y, cost, assignment, bound, converged, _ = (
         t.detach().reshape(a.counts.numel(), *t.shape[a.counts.dim() :]) for t in (a.clean, b.clean, *result)
     )
     for i, (n, m) in enumerate(zip(a.counts.flatten().tolist(), b.counts.flatten().tolist(), strict=True)):
