@@ -1,0 +1,173 @@
+"""The parts of the generator: the image's trunk, the code's branch, and what follows where they meet."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from models.autoencoder import LATENT_DIM
+
+if TYPE_CHECKING:
+    from models.generator import Generator, GeneratorConfig
+
+CODE_DIM = 128
+
+
+def _widen(channels: int, factor: float) -> int:
+    return max(4, round(channels * factor))
+
+
+def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, kernel, stride, padding=(kernel - 1) // 2)
+
+
+def _conv_relu(inputs: int, *layers: tuple[int, int, int]) -> nn.Sequential:
+    """A chain of convolution + ReLU; each layer is (channels, kernel, stride)."""
+    modules: list[nn.Module] = []
+    for outputs, kernel, stride in layers:
+        modules += [_conv(inputs, outputs, kernel, stride), nn.ReLU()]
+        inputs = outputs
+    return nn.Sequential(*modules)
+
+
+def image_trunk(config: GeneratorConfig) -> nn.Sequential:
+    """(B, 3, H, W) -> (B, C, H/8, W/8)."""
+    c16, c32, c64, c128 = (_widen(c, config.trunk_width) for c in (16, 32, 64, 128))
+    return _conv_relu(
+        3,
+        *((c16, 3, 1), (c16, 3, 1), (c32, 3, 2)),
+        *((c32, 3, 1), (c32, 3, 1), (c64, 3, 2)),
+        *((c64, 3, 1), (c64, 3, 1), (c128, 3, 2)),
+        *((c128, 3, 1), (c128, 3, 1)),
+    )
+
+
+class CodeBranch(nn.Module):
+    """Spreads a code over the grid: two fully connected layers, then two convolutions."""
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        super().__init__()
+        rows, columns = config.grid
+        self.spread = nn.Sequential(
+            nn.Linear(CODE_DIM, 256), nn.ReLU(), nn.Linear(256, 3 * rows * columns), nn.ReLU()
+        )
+        self.grid = config.grid
+        outputs = _widen(128, config.trunk_width)
+        self.convs = _conv_relu(3, (_widen(32, config.trunk_width), 3, 1), (outputs, 3, 1))
+
+    def forward(self, codes: Tensor) -> Tensor:
+        return self.convs(self.spread(codes).unflatten(1, (3, *self.grid)))
+
+
+class _Narrowing(nn.Module):
+    """Joined features -> two coarser maps, a bottleneck and a vector: what both endings start with."""
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        super().__init__()
+        c256, c512 = (_widen(c, config.decoder_width) for c in (256, 512))
+        self.down4 = _conv_relu(_joined_channels(config), (c256, 3, 2), (c256, 3, 1), (c256, 3, 1))
+        self.down5 = _conv_relu(c256, (c512, 3, 2), (c512, 3, 1), (c512, 3, 1), (c512, 3, 1))
+        self.bottleneck = _conv_relu(c512, (c512, 5, 2))
+
+        rows, columns = (math.ceil(side / 8) for side in config.grid)
+        hidden = _widen(2048, config.decoder_width), _widen(1024, config.decoder_width)
+        self.fc_hidden = nn.Sequential(
+            nn.Linear(c512 * rows * columns, hidden[0]), nn.ReLU(), nn.Linear(hidden[0], hidden[1]), nn.ReLU()
+        )
+        self.fc_width = hidden[1]
+
+    def narrow(self, joined: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(B, C, h, w) -> maps of h/2 and h/4, the bottleneck of h/8, a vector of fc_width."""
+        x4 = self.down4(joined)
+        x5 = self.down5(x4)
+        bottleneck = self.bottleneck(x5)
+        return x4, x5, bottleneck, self.fc_hidden(bottleneck.flatten(1))
+
+
+class LatentDecoder(_Narrowing):
+    """Joined features -> a code of the auto-encoder of shapes."""
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        super().__init__(config)
+        self.latent = nn.Linear(self.fc_width, LATENT_DIM)
+
+    def forward(self, joined: Tensor) -> Tensor:
+        return self.latent(self.narrow(joined)[-1])
+
+
+class PointDecoder(_Narrowing):
+    """Joined features -> points: a fully connected and an up-convolving branch."""
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        super().__init__(config)
+        c64, c128, c256, c512 = (_widen(c, config.decoder_width) for c in (64, 128, 256, 512))
+        joined = _joined_channels(config)
+        self.fc_points = nn.Linear(self.fc_width, 3 * config.fc_points)
+
+        self.up5, self.skip5 = _deconv(c512, c256), _conv(c512, c256)
+        self.merge5 = _conv_relu(c256, (c256, 3, 1))
+        self.up4, self.skip4 = _deconv(c256, c128), _conv(c256, c128)
+        self.merge4 = _conv_relu(c128, (c128, 3, 1))
+        self.up3, self.skip3 = _deconv(c128, c64), _conv(joined, c64)
+        self.merge3 = _conv_relu(c64, (c64, 3, 1), (c64, 3, 1))
+        self.conv_points = _conv(c64, 6)
+
+    def forward(self, joined: Tensor) -> Tensor:
+        x4, x5, bottleneck, vector = self.narrow(joined)
+        fc_points = self.fc_points(vector).unflatten(1, (-1, 3))
+
+        x = self.merge5(F.relu(_crop(self.up5(bottleneck), x5) + self.skip5(x5)))
+        x = self.merge4(F.relu(_crop(self.up4(x), x4) + self.skip4(x4)))
+        # The ReLU before this one sum is in the released network (and in PSGN's); the other two sums have
+        # none.
+        x = self.merge3(F.relu(F.relu(_crop(self.up3(x), joined)) + self.skip3(joined)))
+        conv_points = self.conv_points(x).permute(0, 2, 3, 1).reshape(len(joined), -1, 3)
+        return torch.cat([fc_points, conv_points], dim=1)
+
+
+def _joined_channels(config: GeneratorConfig) -> int:
+    return _widen(128, config.trunk_width) * (1 if config.deterministic else 2)
+
+
+def _deconv(inputs: int, outputs: int) -> nn.ConvTranspose2d:
+    return nn.ConvTranspose2d(inputs, outputs, 5, stride=2, padding=2, output_padding=1)
+
+
+def _crop(x: Tensor, like: Tensor) -> Tensor:
+    """Drops the last row or column where an odd side was halved and doubled."""
+    return x[..., : like.shape[-2], : like.shape[-1]]
+
+
+def initialise(model: Generator) -> None:
+    """Keeps the second moment of activations through the layers, and starts clouds small, around the origin.
+
+    A layer followed by a ReLU gets variance 2 / fan-in. The layers whose outputs are summed before one ReLU
+    get half of it. With the defaults of torch the signal of the image fades through the trunk's eleven layers.
+    """
+    decoder = model.decoder
+    summed, final = set(), set()
+    if isinstance(decoder, PointDecoder):
+        summed = {decoder.up5, decoder.skip5, decoder.up4, decoder.skip4, decoder.skip3}
+        final = {decoder.fc_points, decoder.conv_points}
+    for module in model.modules():
+        if not isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
+            continue
+        gain = 0.01 if module in final else 1.0 if module in summed else 2.0
+        with torch.no_grad():
+            module.weight.normal_(0.0, math.sqrt(gain / _fan_in(module)))
+            if module.bias is not None:
+                module.bias.zero_()
+
+
+def _fan_in(module: nn.Conv2d | nn.ConvTranspose2d | nn.Linear) -> float:
+    """Inputs that reach one output value; strided transposed kernels reach it with a share of their taps."""
+    if isinstance(module, nn.Linear):
+        return module.in_features
+    taps = module.kernel_size[0] * module.kernel_size[1]
+    if isinstance(module, nn.ConvTranspose2d):
+        taps /= module.stride[0] * module.stride[1]
+    return module.in_channels * taps
