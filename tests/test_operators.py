@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch._library.custom_ops import OPDEFS
 
 import diffpoint as dp
 
@@ -30,6 +31,7 @@ def operator_arguments() -> dict[str, tuple]:
         "approxmatch": (a, b, *lengths, True),
         "farthest_point_sample": (a.detach(), lengths[0], 3, 0),
         "sample_view": (a, dp.splat_depth(a, camera).visible),
+        "visible": (a.detach(), lengths[0], projection.detach(), H, W, "cone", 3.0, 0.4),
     }
 
 
@@ -37,6 +39,11 @@ def operator_arguments() -> dict[str, tuple]:
 def test_operators_pass_opcheck(name):
     operator = getattr(torch.ops.diffpoint, name).default
     torch.library.opcheck(operator, operator_arguments()[name])
+
+
+def test_every_operator_is_checked():
+    registered = {name.removeprefix("diffpoint::") for name in OPDEFS if name.startswith("diffpoint::")}
+    assert {name for name in registered if not name.endswith("_backward")} == set(operator_arguments())
 
 
 @pytest.mark.parametrize(
