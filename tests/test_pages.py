@@ -161,12 +161,16 @@ def test_curves_show_each_stage_and_survive_a_run_that_has_barely_begun():
     ]
     for record in records[::20]:
         record |= {"image_sensitivity": 5.0, "code_sensitivity": 4.0, "dead_share": 0.1}
-    panels = figures.curves_figure(records).axes
+        record |= {"real_score": 2.0, "fake_score": 0.5}
+    before = [{"step": -s, "stage": 0, "cd": 20.0 + s} for s in range(10, 0, -1)]
+    panels = figures.curves_figure([*before, *records]).axes
     assert [line.get_xdata()[[0, -1]].tolist() for line in panels[0].lines] == [[1, 59]] * 2
     assert [line.get_xdata()[[0, -1]].tolist() for line in panels[1].lines] == [[60, 100]]
     mean = panels[0].lines[1].get_ydata()
     assert mean[30] == pytest.approx(30 - 31 / 4, abs=0.2), "the running mean follows the curve"
-    assert len(figures.curves_figure([]).axes) == 6
+    assert set(panels[6].lines[0].get_ydata()) == {-1.5}
+    assert list(panels[7].lines[0].get_ydata()) == [record["cd"] for record in before]
+    assert len(figures.curves_figure([]).axes) == 8
 
 
 def test_errors_figure_shows_the_table():

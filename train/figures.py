@@ -161,8 +161,8 @@ def overview_figure(examples: Sequence[Example]) -> Figure:
 
 def curves_figure(records: Sequence[dict[str, Any]]) -> Figure:
     """A run's losses, validation errors and health over its steps, from the records of metrics.jsonl."""
-    figure = Figure(figsize=(13, 6.6), layout="constrained", dpi=110)
-    panels = np.asarray(figure.subplots(2, 3)).ravel()
+    figure = Figure(figsize=(17, 6.6), layout="constrained", dpi=110)
+    panels = np.asarray(figure.subplots(2, 4)).ravel()
     stages = [[record for record in records if record.get("stage") == stage] for stage in (1, 2)]
     for axes, stage, what in zip(panels[:2], stages, ("each view alone", "views joined"), strict=True):
         _curves(axes, stage, {"front": "front constraint"})
@@ -181,8 +181,21 @@ def curves_figure(records: Sequence[dict[str, Any]]) -> Figure:
     panels[4].set(title="How far predictions move", ylabel="chamfer distance x100", ylim=(0, None))
     _curves(panels[5], records, {"dead_share": "silent channels"})
     panels[5].set(title="How much of the image trunk is silent?", ylabel="share", ylim=(-0.02, 1.02))
+    judged = [
+        {"step": record["step"], "ahead": record["fake_score"] - record["real_score"]}
+        for record in records
+        if "fake_score" in record
+    ]
+    _curves(panels[6], judged, {"ahead": "predictions"})
+    panels[6].axhline(0, color=MUTED, lw=0.8)
+    panels[6].set(title="Can the critic tell predictions?", ylabel="their score - that of real shapes")
+    pretraining = [record for record in records if record.get("stage") == 0]
+    _curves(panels[7], pretraining, {"cd": "trained on", "val_autoencoder_cd": "not trained on"})
+    panels[7].set(
+        title="Auto-encoder: what is lost in a code?", ylabel="chamfer distance x100", ylim=(0, None)
+    )
     if stages[0] and stages[1]:
-        for axes in panels[2:]:
+        for axes in panels[2:7]:
             axes.axvline(stages[0][-1]["step"], color=MUTED, lw=0.8, ls="--")
     return figure
 
