@@ -10,6 +10,7 @@ import torch
 
 from diffpoint import PinholeCamera, unproject
 from train.batches import Sampler, decimate_depth, load_split, min_pool_depth
+from train.data.procedural import generate
 from train.errors import UserError
 
 
@@ -86,6 +87,22 @@ def test_a_limit_takes_shapes_from_the_whole_list(tiny_data: Path) -> None:
     some = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, limit=4, progress=False)
     assert len(some) == 4
     assert set(some.categories) == {"chair", "display"}
+
+
+def test_several_trees_are_put_together_whatever_the_size_of_their_renders(
+    tiny_data: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    generate(other, shapes=6, categories=["table"], seed=1, size=96, views=4, processes=1)
+    both = load_split([tiny_data, other], "train", image_size=(48, 64), map_size=16, progress=False)
+    alone = [
+        load_split(root, "train", image_size=(48, 64), map_size=16, progress=False)
+        for root in (tiny_data, other)
+    ]
+    assert both.ids == alone[0].ids + alone[1].ids
+    assert torch.equal(both.depth, torch.cat([split.depth for split in alone]))
+    few = load_split([tiny_data, other], "train", image_size=(48, 64), map_size=16, limit=4, progress=False)
+    assert set(few.categories) == set(both.categories)
 
 
 def test_the_sampler_repeats_no_shape_and_continues_from_its_state() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
@@ -98,7 +99,7 @@ def test_the_deterministic_counterpart_diversifies_nothing() -> None:
 @pytest.mark.parametrize("profile", ["full", "cpu", "smoke"])
 def test_configurations_survive_the_way_to_disk(profile: str) -> None:
     config = dataclasses.replace(scaled(PROFILES[profile], 0.5), categories=("chair",))
-    assert fit_config_from_json(to_json(config, data="somewhere"), where="x") == config
+    assert fit_config_from_json(to_json(config, data=Path("somewhere")), where="x") == config
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"stage1": 3}', '{"unknown": 1}'])

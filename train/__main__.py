@@ -190,8 +190,8 @@ class Fit:
     before --help to see another's.
     """
 
-    data: Path
-    """Root of a data tree (see the `data` command)."""
+    data: tuple[Path, ...]
+    """Root of a data tree (see the `data` command); several are put together."""
     out: Path
     """Directory of the run: configuration, metrics, checkpoints, TensorBoard events."""
     config: Annotated[FitConfig, arg(name="")]
@@ -213,7 +213,7 @@ class Fit:
             print(f"stopped early and saved; continue with --resume --out {self.out}", file=sys.stderr)
             return 130
         if gather().writes:
-            print(f"trained; see {self.out}, or run: python -m train evaluate {self.out} --data {self.data}")
+            print(f"trained; see {self.out}, or run: python -m train evaluate {self.out} --data {self.data[0]}")
         return 0
 
 

@@ -151,7 +151,7 @@ class Batch(NamedTuple):
 
 
 def load_split(
-    data: Path,
+    data: Path | Sequence[Path],
     split: Literal["train", "val", "test"],
     *,
     image_size: tuple[int, int],
@@ -161,48 +161,52 @@ def load_split(
     limit: int | None = None,
     progress: bool = True,
 ) -> LoadedSplit:
-    """Reads a split of a data tree into memory; broken shapes are named and left out.
+    """Reads a split of one or more data trees into memory; broken shapes are named and left out.
 
     Args:
-        data: root of the tree.
+        data: root of the tree, or of each.
         split: which list to read.
         image_size: height and width of the network's input.
         map_size: side of the depth maps for the front constraint.
         gt_pool: how the depth maps shrink.
         categories: names to keep; none means all.
-        limit: read at most that many shapes, spread evenly over the list.
+        limit: read at most that many shapes, spread evenly over the lists.
         progress: show a bar.
 
     Raises:
         UserError: no such tree, no usable shape, or renders whose side is not a multiple of `map_size`.
     """
-    tree = ShapeTree(data, split, list(categories) or None)
-    if limit is not None and len(tree) > limit:
-        tree.ids = [tree.ids[index * len(tree.ids) // limit] for index in range(limit)]
+    trees = [ShapeTree(root, split, list(categories) or None) for root in _roots(data)]
+    if limit is not None:
+        _thin_out(trees, limit)
     rows: list[_Row] = []
-    bar = tqdm(
-        tree.iter_valid(), f"reading {split}", len(tree), leave=False, unit="shape", disable=not progress
-    )
-    for shape in bar:
-        if (~shape.depth.isfinite()).flatten(1).all(1).any():
-            tree.skipped[shape.id] = f"{shape.id}: one of its views shows nothing"
-            continue
-        if shape.depth.shape[-1] % map_size:
-            raise UserError(
-                f"{data}: renders are {shape.depth.shape[-1]} pixels wide, not a multiple of the map size "
-                f"{map_size}; render at another size or set --map-size"
-            )
-        small = _POOLS[gt_pool](shape.depth, shape.camera, size=map_size)
-        size = (*shape.depth.shape, len(shape.points))
-        images = _bytes_at(shape.images, image_size)
-        rows.append(_Row(shape.id, shape.category, size, images, small.depth, small.camera, shape.points))
-    rows = _of_the_usual_size(rows, tree.skipped)
-    for reason in tree.skipped.values():
+    with tqdm(
+        desc=f"reading {split}", total=sum(map(len, trees)), leave=False, unit="shape", disable=not progress
+    ) as bar:
+        for tree in trees:
+            for shape in tree.iter_valid():
+                bar.update()
+                if (~shape.depth.isfinite()).flatten(1).all(1).any():
+                    tree.skipped[shape.id] = f"{shape.id}: one of its views shows nothing"
+                    continue
+                if shape.depth.shape[-1] % map_size:
+                    raise UserError(
+                        f"{tree.path}: renders are {shape.depth.shape[-1]} pixels wide, not a multiple of the map "
+                        f"size {map_size}; render at another size or set --map-size"
+                    )
+                small = _POOLS[gt_pool](shape.depth, shape.camera, size=map_size)
+                size = (len(shape.depth), len(shape.points))
+                images = _bytes_at(shape.images, image_size)
+                rows.append(
+                    _Row(shape.id, shape.category, size, images, small.depth, small.camera, shape.points)
+                )
+    skipped = {shape: reason for tree in trees for shape, reason in tree.skipped.items()}
+    rows = _of_the_usual_size(rows, skipped)
+    for reason in skipped.values():
         tqdm.write(f"left out: {reason}", file=sys.stderr)
     if not rows:
-        raise UserError(
-            f"{data} has no usable shape in its {split} split; try `python -m train data check {data}`"
-        )
+        where = ", ".join(map(str, _roots(data)))
+        raise UserError(f"{where}: no usable shape in the {split} split; try `python -m train data check`")
     return LoadedSplit(
         images=torch.stack([row.images for row in rows]),
         depth=torch.stack([row.depth for row in rows]),
@@ -214,12 +218,28 @@ def load_split(
     )
 
 
+def _roots(data: Path | Sequence[Path]) -> list[Path]:
+    return [data] if isinstance(data, Path) else list(data)
+
+
+def _thin_out(trees: Sequence[ShapeTree], limit: int) -> None:
+    """Leaves at most `limit` shapes, spread evenly over all trees."""
+    total = sum(map(len, trees))
+    if total <= limit:
+        return
+    kept = {number * total // limit for number in range(limit)}
+    start = 0
+    for tree in trees:
+        ids, tree.ids = tree.ids, [shape for i, shape in enumerate(tree.ids, start) if i in kept]
+        start += len(ids)
+
+
 class _Row(NamedTuple):
-    """What is kept of one shape; `size` is that of the files: views, height, width, points."""
+    """What is kept of one shape; `size` is how many views and points it has."""
 
     id: str
     category: str
-    size: tuple[int, ...]
+    size: tuple[int, int]
     images: Tensor
     depth: Tensor
     camera: PinholeCamera
@@ -232,15 +252,14 @@ def _bytes_at(images: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _of_the_usual_size(rows: list[_Row], skipped: dict[str, str]) -> list[_Row]:
-    """Keeps the shapes with the most common numbers of views, pixels and points; names the others in
-    `skipped`."""
+    """Keeps the shapes with the most common numbers of views and points; names the others in `skipped`."""
 
     if not rows:
         return rows
     usual = Counter(row.size for row in rows).most_common(1)[0][0]
     for row in rows:
         if row.size != usual:
-            skipped[row.id] = f"{row.id}: (views, height, width, points) are {row.size}, elsewhere {usual}"
+            skipped[row.id] = f"{row.id}: (views, points) are {row.size}, elsewhere {usual}"
     return [row for row in rows if row.size == usual]
 
 

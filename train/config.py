@@ -11,7 +11,8 @@ import dataclasses
 import json
 import math
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from train.errors import UserError
@@ -309,9 +310,10 @@ def with_variant(config: FitConfig, variant: Variant) -> FitConfig:
     return dataclasses.replace(config, variant=variant, stage2=stage2)
 
 
-def to_json(config: FitConfig, *, data: str) -> str:
+def to_json(config: FitConfig, *, data: Path | Sequence[Path]) -> str:
     """A run's config.json: the data it was trained on, and every field of its configuration."""
-    return json.dumps({"data": data, **dataclasses.asdict(config)}, indent=2) + "\n"
+    trees = str(data) if isinstance(data, Path) else [str(root) for root in data]
+    return json.dumps({"data": trees, **dataclasses.asdict(config)}, indent=2) + "\n"
 
 
 def fit_config_from_json(text: str, *, where: str) -> FitConfig:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,11 +46,13 @@ class _Run(NamedTuple):
     progress: bool
 
 
-def fit(data: Path, out: Path, config: FitConfig, *, resume: bool = False, progress: bool = True) -> bool:
+def fit(
+    data: Path | Sequence[Path], out: Path, config: FitConfig, *, resume: bool = False, progress: bool = True
+) -> bool:
     """Trains a generator and keeps everything about it in the run directory `out`.
 
     Args:
-        data: root of a data tree with train and val splits.
+        data: root of a data tree with train and val splits, or of each of several that are put together.
         out: the run's directory; must not hold a run yet, unless resuming.
         config: the recipe.
         resume: continue the run in `out` from its newest checkpoint, to the same bits.
@@ -87,7 +89,7 @@ def fit(data: Path, out: Path, config: FitConfig, *, resume: bool = False, progr
             save_weights(load_autoencoder(config.autoencoder), best_weights(out, "autoencoder"))
         training.begin_phase(training.phase_name, out)
     if world.writes:
-        write_text(out / "config.json", to_json(config, data=str(data)))
+        write_text(out / "config.json", to_json(config, data=data))
     log = RunLog(out, step=training.total_steps, writes=world.writes)
     try:
         with StopRequest() as stop:
