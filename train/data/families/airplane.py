@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from train.data.families.design import Design, Family, fitted, hsv, metal
-from train.data.solids import Solid, body, box, ellipsoid, revolved, wing
+from train.data.solids import Point, Solid, body, box, ellipsoid, revolved, wing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +158,7 @@ def _engines(
     return parts
 
 
-def _nacelle(centre, radius: float, long: float, colour: np.ndarray) -> Solid:
+def _nacelle(centre: Point, radius: float, long: float, colour: np.ndarray) -> Solid:
     profile = [(0.62, -0.5), (0.9, -0.25), (1.0, 0.1), (0.98, 0.4), (0.85, 0.5)]
     scaled = [(r * radius, z * long) for r, z in profile]
     return revolved(scaled, centre, colour, axis=(0, 0, 1), sides=14)

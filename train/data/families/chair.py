@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from train.data.families.design import Cone, Design, Family, Plate, colours, shadow_body
+from train.data.families.design import SHARP, Cone, Design, Family, Plate, colours, shadow_body
 from train.data.solids import Solid, bar, box, frustum, loft, oval, slab, tube
 
 _CONE = Cone(azimuth_deg=15, elevation_deg=15)
@@ -21,19 +21,19 @@ def _design(visible: np.random.Generator) -> Design:
     front_z, under_seat = _BACK_Z + depth, seat_top - thickness
     floor = under_seat - leg_height
 
-    roundness = visible.choice([60.0, 6.0, 3.5])
+    roundness = visible.choice([SHARP, 6.0, 3.5])
     outline = _seat_outline(visible, width, depth, roundness)
     parts = [slab(outline, under_seat, seat_top, seat_colour)]
     if visible.random() < 0.4:  # a cushion
-        parts.append(slab(outline * (0.9, 1) - (0, 0.0), seat_top, seat_top + 0.025, frame_colour))
+        parts.append(slab(outline * (0.9, 1), seat_top, seat_top + 0.025, frame_colour))
     parts += _base(visible, (width, depth), (under_seat + 0.01, floor), frame_colour)
     parts += _arms(visible, width, seat_top, (_BACK_Z, front_z), frame_colour)
 
     plate_thickness = visible.uniform(0.025, 0.06)
     low, high = seat_top - 0.01, seat_top + back_height
     top_width = width * visible.uniform(0.7, 1.0)
-    squareness = visible.choice([60.0, 8.0, 4.0])
-    if squareness == 60:
+    squareness = visible.choice([SHARP, 8.0, 4.0])
+    if squareness == SHARP:
         corners = np.array([(-width, low), (width, low), (top_width, high), (-top_width, high)]) * (0.5, 1)
         rings = [np.column_stack((corners, np.full(4, z))) for z in (_BACK_Z, _BACK_Z + plate_thickness)]
     else:
@@ -46,7 +46,7 @@ def _design(visible: np.random.Generator) -> Design:
     plate = Plate(top_width, low + 0.02, high, _BACK_Z, _CONE)
 
     def back(hidden: np.random.Generator, mode: int) -> list[Solid]:
-        return shadow_body(hidden, _DEPTHS[mode], plate, shell_colour, squareness=min(squareness, 60.0))
+        return shadow_body(hidden, _DEPTHS[mode], plate, shell_colour, squareness=squareness)
 
     return Design(parts, back, visible.uniform(0.78, 1.0))
 

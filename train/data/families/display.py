@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from train.data.families.design import Cone, Design, Family, Plate, colours, hsv, shadow_body
+from train.data.families.design import SHARP, Cone, Design, Family, Plate, colours, hsv, shadow_body
 from train.data.solids import Solid, bar, box, frustum, loft, oval, tube
 
 _CONE = Cone(azimuth_deg=15, elevation_deg=15)
@@ -23,7 +23,7 @@ def _design(visible: np.random.Generator) -> Design:
     )
     centre_y = visible.uniform(0.04, 0.09)
     low, high = centre_y - height / 2, centre_y + height / 2
-    squareness = visible.choice([60.0, 12.0])
+    squareness = visible.choice([SHARP, 12.0])
     frame = [
         oval(width * s, height * s, (0, centre_y, _BACK_Z + z), squareness=squareness, sides=24)
         for z, s in ((0, 1), (thickness - 0.006, 1), (thickness, 0.985))

@@ -22,7 +22,8 @@ def _design(visible: np.random.Generator) -> Design:
     floor = visible.uniform(-0.26, -0.2)
     base_low, seat_top = floor + leg, floor + leg + base_height
     front_z = _BACK_Z + depth
-    seat = _soft((width, base_height, depth), (0, (base_low + seat_top) / 2, _BACK_Z + depth / 2), visible)
+    nose = visible.uniform(0.005, 0.4) * base_height
+    seat = _soft((width, base_height, depth), (0, (base_low + seat_top) / 2, _BACK_Z + depth / 2), nose)
     parts = [loft(seat, fabric)]
     back_height, back_thick = visible.uniform(0.14, 0.3), visible.uniform(0.05, 0.1)
     high = seat_top + back_height
@@ -69,16 +70,14 @@ def _design(visible: np.random.Generator) -> Design:
 SOFA = Family(_design, _CONE)
 
 
-def _soft(size: tuple[float, float, float], centre: tuple[float, float, float], visible) -> list[np.ndarray]:
-    """Rings of a cushion-like box along z: its front edge is more or less round."""
+def _soft(
+    size: tuple[float, float, float], centre: tuple[float, float, float], nose: float
+) -> list[np.ndarray]:
+    """Rings of a cushion-like box along z; its front edge is rounded over the length `nose`."""
     width, height, depth = size
-    nose = visible.uniform(0.005, 0.4) * height
     x, y, z = centre
     stations = [(-depth / 2, 1.0), (depth / 2 - nose, 1.0), (depth / 2 - nose * 0.3, 0.93), (depth / 2, 0.75)]
-    return [
-        oval(width * (0.5 + s / 2), height * s, (x, y, z + at), squareness=visible.choice([14.0]))
-        for at, s in stations
-    ]
+    return [oval(width * (0.5 + s / 2), height * s, (x, y, z + at), squareness=14.0) for at, s in stations]
 
 
 def _arched(ring: np.ndarray, above: float, camel: float, width: float) -> np.ndarray:

@@ -212,15 +212,16 @@ def _dial(visible: np.random.Generator, shell: np.ndarray, dark: np.ndarray) -> 
 
 
 def _handset(visible: np.random.Generator, shell: np.ndarray, dark: np.ndarray) -> list[Solid]:
-    """A receiver alone, standing or lying, with its cord."""
-    parts = _receiver(visible, visible.uniform(0.75, 0.95), shell)
+    """A receiver alone: lying with its cord, or without one and tilted or upright."""
+    receiver = _receiver(visible, visible.uniform(0.75, 0.95), shell)
     turns, long = int(visible.integers(6, 12)), visible.uniform(0.3, 0.6)
     share = np.linspace(0, 1, turns * 8 + 1)
     angle = share * turns * 2 * np.pi
     cord = np.stack((0.045 * np.cos(angle) - 0.38, -0.12 - long * share, 0.045 * np.sin(angle)), axis=1)
-    parts.append(tube(cord, [0.014] * len(cord), dark, sides=6))
     tilt = visible.choice([0.0, 90.0, visible.uniform(20, 70)])
-    return [part.turned("z", tilt) for part in parts[: 2 + 1]] + ([] if tilt else parts[3:])
+    if tilt == 0:
+        return [*receiver, tube(cord, [0.014] * len(cord), dark, sides=6)]
+    return [part.turned("z", tilt) for part in receiver]
 
 
 _KINDS = {
