@@ -19,9 +19,10 @@ import pytest
 import torch
 
 from train import state as state_module
+from train.__main__ import main
 from train.batches import load_split
 from train.checkpoint import latest_checkpoint, load_generator
-from train.config import PROFILES
+from train.config import PROFILES, fit_config_from_json
 from train.errors import UserError
 from train.fit import fit
 from train.log import read_metrics
@@ -201,6 +202,21 @@ def test_sigkill_loses_nothing_but_time(
         process.wait()
     subprocess.run(_fit_command(tiny_data, run, "--resume"), check=True, stderr=subprocess.DEVNULL)
     _assert_same_run(run, smoke_run)
+
+
+def test_the_highly_diverse_model_from_the_command_line(
+    tiny_data: Path, smoke_run: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    fit_it = ["fit", "--data", str(tiny_data), "--out", str(run), "--profile", "smoke", "--steps", "3"]
+    assert main([*fit_it, "--variant", "highly-diverse", "--autoencoder", str(smoke_run)]) == 0
+    config = fit_config_from_json((run / "config.json").read_text(), where="config.json")
+    assert (config.variant, config.stage2.joined_diversity, config.stage2.steps) == (
+        "highly-diverse",
+        True,
+        3,
+    )
+    assert [r["stage"] for r in read_metrics(run)] == [1, 1, 1, 2, 2, 2]
 
 
 def test_resuming_a_finished_run_changes_nothing(tiny_data: Path, smoke_run: Path) -> None:

@@ -8,10 +8,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from diffpoint import PinholeCamera, unproject
-from train.config import EXACT_MEAN_EMD_FROM_PAPER, PROFILES, fit_config_from_json, scaled, to_json
+from diffpoint import PinholeCamera, diversity_loss, unproject
+from train.config import (
+    EXACT_MEAN_EMD_FROM_PAPER,
+    PROFILES,
+    fit_config_from_json,
+    scaled,
+    to_json,
+    with_steps,
+    with_variant,
+)
 from train.errors import UserError
-from train.objective import Scene, arrange_scenes, front_loss
+from train.objective import Scene, arrange_scenes, front_loss, spread_loss
 
 
 def _cameras(shapes: int, views: int, size: int) -> PinholeCamera:
@@ -88,6 +96,7 @@ def test_full_profile_holds_the_papers_numbers() -> None:
     assert (first.shapes, first.views, first.codes, first.steps) == (2, 8, 5, 40_000)
     assert (first.alpha, first.beta, first.front) == (0.2, 10, "emd")
     assert (second.alpha, second.beta, second.front, second.steps) == (0.1, 1, "chamfer", 100_000)
+    assert (first.gamma, second.gamma, first.n_critic, first.penalty) == (0.1, 0.1, 1, 10)
     assert first.exact_alpha == pytest.approx(0.2 * EXACT_MEAN_EMD_FROM_PAPER)
 
 
@@ -113,3 +122,40 @@ def test_scaling_shortens_everything_alike() -> None:
     assert config.pretrain.steps == PROFILES["cpu"].pretrain.steps // 4
     assert config.stage1.steps == PROFILES["cpu"].stage1.steps // 4
     assert config.stage1.ramp[1] == PROFILES["cpu"].stage1.ramp[1] // 4
+
+
+def test_other_lengths_keep_ramps_and_warm_ups_in_proportion() -> None:
+    config = with_steps(PROFILES["full"], 20)
+    assert (config.pretrain.steps, config.stage1.steps, config.stage2.steps) == (20, 20, 20)
+    assert config.stage1.ramp == (0, 2)  # of 40 000 steps, 1 000 and 4 000
+    assert config.stage1.warmup == 0
+    assert with_steps(PROFILES["full"], 80_000).stage1.ramp == (2_000, 8_000)
+
+
+def test_the_highly_diverse_model_asks_the_joined_clouds_for_a_whole_object_of_change() -> None:
+    config = with_variant(PROFILES["full"], "highly-diverse")
+    stage = config.stage2
+    assert (stage.joined_diversity, stage.beta, stage.steps) == (True, 0.5, 40_000)
+    assert stage.exact_alpha == pytest.approx(15)
+    assert config.stage1 == PROFILES["full"].stage1
+    assert with_variant(PROFILES["full"], "standard") == PROFILES["full"]
+
+    torch.manual_seed(0)
+    views, codes, clouds = 4, torch.randn(3, 8, 128), torch.rand(3, 8, 300, 3)
+    same = clouds[:1].expand_as(clouds)
+    spread = spread_loss(codes, same, stage, views=views, step=0)
+    by_view = (codes[[0, 0, 1]] - codes[[1, 2, 2]]).norm(dim=-1).unflatten(1, (2, views))
+    assert spread.item() == pytest.approx(by_view.mean().item(), rel=1e-2)  # identical clouds move nothing
+    moved = torch.stack([clouds[0], clouds[0] + 0.5, clouds[0] + 1.0])
+    assert spread_loss(codes, moved, stage, views=views, step=0) < spread - 5
+
+
+def test_the_stages_compare_the_clouds_of_single_images() -> None:
+    """Half of the images and every other point, in turns; exchanging clouds between views changes the loss."""
+    stage = dataclasses.replace(
+        PROFILES["cpu"].stage2, shapes=2, views=2, diversity_images=2, diversity_stride=2, alpha=1e-3
+    )
+    torch.manual_seed(0)
+    codes, clouds = torch.randn(2, 4, 128), torch.rand(2, 4, 60, 3)
+    expected = diversity_loss(codes[:, [0, 2]], clouds[:, [0, 2], 1::2].contiguous(), alpha=stage.exact_alpha)
+    assert torch.equal(spread_loss(codes, clouds, stage, views=2, step=3), expected)

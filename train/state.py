@@ -104,8 +104,9 @@ class Training:
             clouds = self._draw_clouds(phase.shapes)
             laps.stop("data")
             rate = phase.learning_rate_at(self.step)
-            report = autoencoder_step(self.learner.autoencoder, self.learner.optimiser, clouds, rate=rate)
-            laps.stop("network")
+            report = autoencoder_step(
+                self.learner.autoencoder, self.learner.optimiser, clouds, rate=rate, laps=laps
+            )
         else:
             batch, chance = self._draw(phase)
             laps.stop("data")

@@ -141,15 +141,25 @@ def critic_steps(
 
 
 def autoencoder_step(
-    autoencoder: Autoencoder, optimiser: torch.optim.Optimizer, clouds: Tensor, *, rate: float
+    autoencoder: Autoencoder,
+    optimiser: torch.optim.Optimizer,
+    clouds: Tensor,
+    *,
+    rate: float,
+    laps: Laps | None = None,
 ) -> dict[str, Tensor]:
     """One step of the auto-encoder: clouds (B, P, 3) are written down and read again; mean chamfer distance."""
+    laps = laps or Laps()
     set_rate(optimiser, rate)
-    distance = chamfer_distance(autoencoder(clouds), clouds, squared=False)
+    rebuilt = laps.on_the_way_back(autoencoder(clouds), "distances")
+    laps.stop("network")
+    distance = chamfer_distance(rebuilt, clouds, squared=False)
     loss = (distance.a_to_b + distance.b_to_a).mean()
+    laps.stop("distances")
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
     optimiser.step()
+    laps.stop("network")
     return {"loss": loss.detach(), "cd": 100 * loss.detach()}
 
 
