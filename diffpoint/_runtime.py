@@ -55,7 +55,12 @@ class _Runtime:
     def current_program(self) -> Any:
         """The running Taichi program, whoever started it; None before any."""
         backend = sys.modules.get("taichi") or sys.modules.get("quadrants")
-        return backend.lang.impl.get_runtime().prog if backend is not None else None
+        if backend is None:
+            return None
+        runtime = backend.lang.impl.get_runtime()
+        return (
+            runtime._prog if hasattr(runtime, "_prog") else runtime.prog
+        )  # quadrants' `prog` raises before a start
 
     def ensure_started(self) -> int:
         """Start Taichi if nobody has. Returns the spread factor of parallel loops."""
@@ -115,7 +120,8 @@ def _installed_backend() -> str:
 
 def _quiet_import(name: str) -> ModuleType:
     if name not in sys.modules:
-        os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+        for backend in ("TAICHI", "QUADRANTS"):
+            os.environ.setdefault(f"ENABLE_{backend}_HEADER_PRINT", "0")
         os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # it would start a thread and use the network
     return importlib.import_module(name)
 
