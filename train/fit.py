@@ -163,7 +163,7 @@ def _means(report: Mapping[str, Tensor], world: World) -> dict[str, float]:
 
 def _bar_values(record: Mapping[str, Any]) -> dict[str, str]:
     names = {
-        "cd": "cd", "front": "front", "diversity": "div", "fake_score": "critic",
+        "cd": "cd", "front": "front", "matched_share": "matched", "diversity": "div", "critic_loss": "critic",
         "image_sensitivity": "image", "code_sensitivity": "code",
     }  # fmt: skip
     shown = {short: f"{record[name]:.2f}" for name, short in names.items() if name in record}
