@@ -100,7 +100,7 @@ def _sample_view(points: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tenso
     if sampled.numel():
         flat = batch * views
         _bridge.launch(
-            "splat",
+            "views",
             "gather_visible",
             points.dtype,
             points,
@@ -125,7 +125,7 @@ def _sample_view_backward(index: Tensor, grad_sampled: Tensor, count: int) -> Te
     if index.numel():
         flat = batch * views
         _bridge.launch(
-            "splat",
+            "views",
             "scatter_visible",
             grad_sampled.dtype,
             index.view(flat, largest),

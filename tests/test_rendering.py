@@ -124,6 +124,22 @@ def test_a_radius_covers_the_pixels_whose_centre_it_reaches():
     assert touched.nonzero().tolist() == [[2, 0]]
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("radius", [0.5, 1.0, 2.0])
+def test_points_on_borders_and_in_middles_of_pixels_cover_what_their_twins_cover(dtype, radius):
+    """And a few roundings beside them, in the map and outside; all at one depth, so that only the index tells."""
+    camera = dp.PinholeCamera(torch.eye(3, dtype=dtype), torch.eye(4, dtype=dtype), 3, 5)
+    generator = torch.Generator().manual_seed(0)
+    halves = torch.randint(-3, 14, (2, 40, 2), generator=generator) / 2
+    beside = torch.randint(-2, 3, halves.shape, generator=generator) * torch.finfo(dtype).eps / 4
+    points = torch.cat((halves.to(dtype) + beside, torch.ones(2, 40, 1)), dim=-1)
+    splat = dp.splat_depth(points, camera, radius=radius)
+    K, cam_from_world = camera.expand(2, 1).K, camera.expand(2, 1).cam_from_world
+    _, index, visible = reference.splat_depth(points, K, cam_from_world, 3, 5, radius=radius)
+    assert torch.equal(splat.index, index)
+    assert torch.equal(splat.visible, visible)
+
+
 @pytest.mark.parametrize("shape", [(), (3,), (1, 3), (2, 3)])
 def test_cameras_are_shared_or_per_cloud(shape):
     points = clouds(torch.float32)
@@ -346,7 +362,7 @@ def test_boundary_points_are_those_that_two_renderers_may_place_differently():
     assert not (moved & ~boundary_points(points, camera, margin=1e-4)).any()
 
 
-@pytest.mark.parametrize("radius", [0.0, 1.2])
+@pytest.mark.parametrize("radius", [0.0, 1.0, 1.2])
 def test_a_large_cloud_in_parts_gives_the_maps_of_the_whole(radius):
     """A lone large cloud is shared out among the threads; nine of them are not. Copies of points make equal depths."""
     camera = cameras(torch.float32)[0, 0]

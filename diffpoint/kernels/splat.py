@@ -1,20 +1,21 @@
-"""Point splatting to depth maps with a contributor index, and the compaction of visible points."""
+"""Point splatting to depth maps with a contributor index."""
 
 from types import SimpleNamespace
 
 from diffpoint.kernels._backend import ti
 
 TILE = 8  # points whose image positions are computed at once, in vector registers
+EMPTY = 0x7F800000_FFFFFFFF  # the key of an empty pixel: the bits of +inf, then those of -1
 
 
 def build(real):
+    # A float32 depth and its point fit one 64-bit key: the bits of positive floats are in their order, so the smallest
+    # key is the nearest depth, then the lowest index. The map of indices holds the keys until they are decoded.
+    packed = real == ti.f32
     # The camera in registers, clouds as flat arrays: indexing in three dimensions would cost more than the arithmetic.
     reals = ti.types.ndarray(dtype=real, ndim=1)
     integers = ti.types.ndarray(dtype=ti.i64, ndim=1)
     flags = ti.types.ndarray(dtype=ti.u8, ndim=1)
-    points3 = ti.types.ndarray(dtype=real, ndim=3)
-    index2 = ti.types.ndarray(dtype=ti.i64, ndim=2)
-    flags2 = ti.types.ndarray(dtype=ti.u8, ndim=2)
 
     @ti.func
     def image_position(camera: ti.template(), x, y, z):
@@ -24,6 +25,10 @@ def build(real):
         u = (camera[0] * x + camera[1] * y + camera[2] * z + camera[3]) * inverse
         v = (camera[4] * x + camera[5] * y + camera[6] * z + camera[7]) * inverse
         return u, v, d
+
+    @ti.func
+    def image_position_of(camera: ti.template(), points: ti.template(), i):
+        return image_position(camera, points[3 * i], points[3 * i + 1], points[3 * i + 2])
 
     @ti.func
     def fill(values: ti.template(), start, stop, value):
@@ -52,73 +57,139 @@ def build(real):
             visible[start[1] + i] = ti.cast(wins, ti.u8)
 
     @ti.func
-    def floor_within(x, size):
-        """floor(x) cut to [-1, size], so that it fits an integer; a call of ti.floor would cost ten times as much."""
-        return ti.select(x >= real(0.0), ti.cast(ti.select(x < size, x, size), ti.i32), -1)
+    def clear(depth: ti.template(), index: ti.template(), start, stop):
+        if ti.static(packed):
+            fill(index, start, stop, ti.i64(EMPTY))
+        else:
+            fill(depth, start, stop, real(ti.math.inf))
+            fill(index, start, stop, ti.i64(-1))
 
     @ti.func
-    def ceil_within(x, size):
-        below = floor_within(x, size)
-        return ti.select(ti.cast(below, real) < x, below + 1, below)
+    def offer(depth: ti.template(), index: ti.template(), p, i, d):
+        """Point `i` of depth `d` competes for pixel `p`; of depth NaN, in vain.
+
+        By selects: nobody could foresee a branch.
+        """
+        if ti.static(packed):
+            key = (ti.cast(ti.bit_cast(d, ti.i32), ti.i64) << 32) | ti.cast(i, ti.i64)
+            before = index[p]
+            index[p] = ti.select(key < before, key, before)
+        else:
+            before = depth[p]
+            owner = index[p]
+            wins = (d < before) | ((d == before) & (i < owner))
+            depth[p] = ti.select(wins, d, before)
+            index[p] = ti.select(wins, ti.cast(i, ti.i64), owner)
+
+    @ti.func
+    def decode_one(depth: ti.template(), index: ti.template(), p):
+        key = index[p]
+        depth[p] = ti.bit_cast(ti.cast(key >> 32, ti.i32), real)
+        index[p] = ti.cast(ti.cast(key, ti.i32), ti.i64)
+
+    @ti.func
+    def decode(depth: ti.template(), index: ti.template(), start, stop):
+        """Sixteen at a time, as in `fill`."""
+        blocks = (stop - start) // 16
+        for block in range(blocks):
+            for s in ti.static(range(16)):
+                decode_one(depth, index, start + block * 16 + s)
+        for p in range(start + blocks * 16, stop):
+            decode_one(depth, index, p)
+
+    @ti.func
+    def within(x, low, high):
+        """Cut to [low, high], NaN to low: two instructions, as long as the comparisons stay in this form."""
+        above = ti.select(x > low, x, low)
+        return ti.select(above < high, above, high)
+
+    @ti.func
+    def floor_of(x):
+        """Of what fits an integer; a call of ti.floor would cost ten times as much."""
+        cut = ti.cast(x, ti.i32)
+        return ti.select(ti.cast(cut, real) > x, cut - 1, cut)
 
     @ti.func
     def cover_disc(depth: ti.template(), index: ti.template(), start, i, u, v, d, size, radius):
         """Point `i` competes for its own pixel and for those whose centre lies within `radius` pixels of it."""
-        margin = radius + real(1.0)
         half = real(0.5)
+        margin = radius + real(1.0)
         if (d > real(0.0)) & (u > -margin) & (u < size[1] + margin) & (v > -margin) & (v < size[0] + margin):
-            own_row = floor_within(v, size[0])
-            own_column = floor_within(u, size[1])
-            top = ti.max(ti.min(ceil_within(v - radius - half, size[0]), own_row), 0)
-            left = ti.max(ti.min(ceil_within(u - radius - half, size[1]), own_column), 0)
-            width = ti.cast(size[1], ti.i32)
-            bottom = ti.max(floor_within(v + radius - half, size[0]), own_row)
-            bottom = ti.min(bottom, ti.cast(size[0], ti.i32) - 1)
-            right = ti.min(ti.max(floor_within(u + radius - half, size[1]), own_column), width - 1)
-            # One loop over both: a loop over a row's few pixels would be unrolled and guarded at greater cost.
-            row = top
-            column = left
-            for _ in range(ti.max(bottom - top + 1, 0) * ti.max(right - left + 1, 0)):
-                p = start[0] + row * width + column
-                du = ti.cast(column, real) + half - u
-                dv = ti.cast(row, real) + half - v
-                # Each select hangs on one comparison of floats: of several conditions a branch would be made.
-                apart = ti.select((row == own_row) & (column == own_column), 0, 1)
-                reached = ti.cast(apart, real) * (du * du + dv * dv) <= radius * radius
-                candidate = ti.select(reached, d, real(ti.math.inf))
-                before = depth[p]
-                owner = index[p]
-                wins = candidate < before
-                depth[p] = ti.select(wins, candidate, before)
-                index[p] = ti.select(wins, ti.cast(i, ti.i64), owner)
-                ends = column == right
-                row = ti.select(ends, row + 1, row)
-                column = ti.select(ends, left, column + 1)
+            columns = ti.cast(size[1], ti.i32)
+            own_row = floor_of(within(v, real(-1.0), size[0]))
+            own_column = floor_of(within(u, real(-1.0), size[1]))
+            # From ceil(v - radius - 1/2) to floor(v + radius - 1/2), and a quarter of a pixel for rounding.
+            reach = ti.max(radius, half) - real(0.25)
+            top = floor_of(within(v - reach, real(0.0), size[0]))
+            bottom = floor_of(within(v + reach, real(-1.0), size[0] - real(1.0)))
+            left = floor_of(within(u - reach, real(0.0), size[1]))
+            right = floor_of(within(u + reach, real(-1.0), size[1] - real(1.0)))
+            for row in range(top, bottom + 1):
+                for column in range(left, right + 1):
+                    du = ti.cast(column, real) + half - u
+                    dv = ti.cast(row, real) + half - v
+                    own = (row == own_row) & (column == own_column)
+                    covered = own | (du * du + dv * dv <= radius * radius)
+                    candidate = ti.select(covered, d, real(ti.math.nan))
+                    offer(depth, index, start + row * columns + column, i, candidate)
 
     @ti.func
-    def cover_four(depth: ti.template(), index: ti.template(), start, i, u, v, d, size, radius):
-        """`cover_disc` away from the map's edge, for a radius of at most 1: the own pixel, and on the nearer side of it
-        one of its row, one of its column and one across. Without a loop, whose branches would be missed."""
+    def reaches(x_own, y_own, du, dv, reach):
+        return (x_own & y_own) | (du * du + dv * dv <= reach)
+
+    @ti.func
+    def cover_four(
+        depth: ti.template(), index: ti.template(), start, i: ti.template(), u, v, d, size, radius
+    ):
+        """`cover_disc` of a tile of points, of which `i` is the first, for a radius of at most 1.
+
+        Only the four pixels whose centres are nearest come into question, so there is no loop and no branch. A pixel
+        outside the map is replaced by its neighbour inside, for which the point then competes in vain.
+
+        Returns:
+            Whether a point lies so near to the middle of its pixel that it may reach both sides: more than these four.
+        """
+        zero = real(0.0)
         half = real(0.5)
-        column = ti.cast(u, ti.i32)
-        row = ti.cast(v, ti.i32)
-        beside = ti.select(u - ti.cast(column, real) < half, -1, 1)
-        above = ti.select(v - ti.cast(row, real) < half, -1, 1)
+        one = real(1.0)
+        nan = real(ti.math.nan)
+        # Of the four pixels the lower right one, whose neighbours have the numbers before; as floats, which the
+        # processor handles four at a time with more kinds of instructions than integers.
+        right = ti.cast(ti.cast(within(u + half, zero, size[1]), ti.i32), real)
+        bottom = ti.cast(ti.cast(within(v + half, zero, size[0]), ti.i32), real)
+        du0 = right - half - u
+        du1 = right + half - u
+        dv0 = bottom - half - v
+        dv1 = bottom + half - v
+        own0 = u < right
+        own1 = u >= right
+        above = v < bottom
+        below = v >= bottom
+        reach = radius * radius
+        in0 = (right >= one) & (d > zero)
+        in1 = (right < size[1]) & (d > zero)
+        in_top = bottom >= one
+        in_bottom = bottom < size[0]
+        d00 = ti.select(in_top & in0 & reaches(own0, above, du0, dv0, reach), d, nan)
+        d01 = ti.select(in_top & in1 & reaches(own1, above, du1, dv0, reach), d, nan)
+        d10 = ti.select(in_bottom & in0 & reaches(own0, below, du0, dv1, reach), d, nan)
+        d11 = ti.select(in_bottom & in1 & reaches(own1, below, du1, dv1, reach), d, nan)
+        column0 = ti.cast(ti.select(right > one, right - one, zero), ti.i32)
+        column1 = ti.cast(ti.select(right < size[1] - one, right, size[1] - one), ti.i32)
+        row0 = ti.cast(ti.select(bottom > one, bottom - one, zero), ti.i32)
+        row1 = ti.cast(ti.select(bottom < size[0] - one, bottom, size[0] - one), ti.i32)
         width = ti.cast(size[1], ti.i32)
-        for k in ti.static(range(4)):
-            c = column + beside * (k % 2)
-            r = row + above * (k // 2)
-            du = ti.cast(c, real) + half - u
-            dv = ti.cast(r, real) + half - v
-            # Out of reach, it competes for its own pixel again, in vain: one select less, hence no branch.
-            reached = du * du + dv * dv <= radius * radius
-            offset = above * (k // 2) * width + beside * (k % 2)
-            p = start[0] + row * width + column + ti.select(reached, offset, 0)
-            before = depth[p]
-            owner = ti.cast(index[p], ti.i32)
-            wins = d < before
-            depth[p] = ti.select(wins, d, before)
-            index[p] = ti.select(wins, i, owner)
+        for s in ti.static(range(TILE)):
+            p0 = start + row0[s] * width
+            p1 = start + row1[s] * width
+            offer(depth, index, p0 + column0[s], i + s, d00[s])
+            offer(depth, index, p0 + column1[s], i + s, d01[s])
+            offer(depth, index, p1 + column0[s], i + s, d10[s])
+            offer(depth, index, p1 + column1[s], i + s, d11[s])
+        du = ti.select(du0 * du0 < du1 * du1, du0 * du0, du1 * du1)
+        dv = ti.select(dv0 * dv0 < dv1 * dv1, dv0 * dv0, dv1 * dv1)
+        nearest = ti.select(du < dv, du, dv).min()
+        return nearest < real(1e-10)  # far more than the rounding errors of u + half
 
     @ti.func
     def mark_owners(index: ti.template(), visible: ti.template(), start, pixels):
@@ -163,8 +234,11 @@ def build(real):
                     view = at // parts
                     cloud = view // views
                     start = ti.Vector([at * pixels, view * count])  # of the map, and of the view's flags
-                    fill(depth, start[0], start[0] + pixels, real(ti.math.inf))
-                    fill(index, start[0], start[0] + pixels, ti.i64(-1))
+                    if ti.static(disc):
+                        clear(depth, index, start[0], start[0] + pixels)
+                    else:
+                        fill(depth, start[0], start[0] + pixels, real(ti.math.inf))
+                        fill(index, start[0], start[0] + pixels, ti.i64(-1))
                     share = (count + parts - 1) // parts
                     first = (at % parts) * share
                     stop = ti.min(first + share, count)
@@ -172,8 +246,9 @@ def build(real):
                     last = ti.min(ti.cast(lengths[cloud], ti.i32), stop)
                     camera = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
                     size = ti.Vector([ti.cast(height, real), ti.cast(width, real)])
-                    # The loops over a disc outweigh the arithmetic of its point, and are not worth eight copies.
-                    tiles = 0 if ti.static(disc) else ti.max(last - first, 0) // TILE
+                    tiles = ti.max(last - first, 0) // TILE
+                    if ti.static(disc):
+                        tiles = ti.select(radius > real(1.0), 0, tiles)
                     sums = ti.Vector([real(0.0) for _ in ti.static(range(TILE))])
                     for t in range(tiles):
                         i = first + t * TILE
@@ -183,30 +258,28 @@ def build(real):
                         z = ti.Vector([points[offset + 3 * s + 2] for s in ti.static(range(TILE))])
                         u, v, d = image_position(camera, x, y, z)
                         sums += d
-                        for s in ti.static(range(TILE)):
-                            cover_one(depth, index, visible, start, i + s, u[s], v[s], d[s], size)
+                        if ti.static(disc):
+                            if cover_four(depth, index, start[0], i, u, v, d, size, radius):
+                                for j in range(i, i + TILE):
+                                    a, b, c = image_position_of(camera, points, cloud * count + j)
+                                    cover_disc(depth, index, start[0], j, a, b, c, size, radius)
+                        else:
+                            for s in ti.static(range(TILE)):
+                                cover_one(depth, index, visible, start, i + s, u[s], v[s], d[s], size)
                     rest = sums.sum()
                     for i in range(first + tiles * TILE, last):
-                        offset = (cloud * count + i) * 3
-                        u, v, d = image_position(
-                            camera, points[offset], points[offset + 1], points[offset + 2]
-                        )
+                        u, v, d = image_position_of(camera, points, cloud * count + i)
                         rest += d
                         if ti.static(disc):
-                            inner = (u >= real(1.0)) & (u < size[1] - real(1.0))
-                            inner = inner & (v >= real(1.0)) & (v < size[0] - real(1.0)) & (d > real(0.0))
-                            # A point in the middle of its pixel may be equally near to both sides.
-                            inner = inner & (u - real(0.5) != ti.cast(ti.cast(u, ti.i32), real))
-                            inner = inner & (v - real(0.5) != ti.cast(ti.cast(v, ti.i32), real))
-                            if inner & (radius <= real(1.0)):
-                                cover_four(depth, index, start, i, u, v, d, size, radius)
-                            else:
-                                cover_disc(depth, index, start, i, u, v, d, size, radius)
+                            cover_disc(depth, index, start[0], i, u, v, d, size, radius)
                         else:
                             cover_one(depth, index, visible, start, i, u, v, d, size)
                     total[at] = rest
-                    if ti.static(disc) and parts == 1:
-                        mark_owners(index, visible, start, pixels)
+                    if ti.static(disc):
+                        if ti.static(packed):
+                            decode(depth, index, start[0], start[0] + pixels)
+                        if parts == 1:
+                            mark_owners(index, visible, start, pixels)
 
         return forward
 
@@ -275,48 +348,6 @@ def build(real):
                     for k in ti.static(range(4)):
                         grad_projection[view * 12 + 8 + k] = total[k]
 
-    @ti.kernel
-    def gather_visible(
-        points: points3,
-        visible: flags2,
-        sampled: points3,
-        index: index2,
-        views: ti.i32,
-        spread: ti.i32,
-    ):
-        """Visible points moved to the front of each view's row, in their own order; zeros and -1 behind."""
-        for step in range(visible.shape[0] * spread):
-            if step % spread == 0:
-                view = step // spread
-                cloud = view // views
-                slot = 0
-                for i in range(points.shape[1]):
-                    if visible[view, i] != 0:
-                        for k in ti.static(range(3)):
-                            sampled[view, slot, k] = points[cloud, i, k]
-                        index[view, slot] = i
-                        slot += 1
-                for rest in range(slot, sampled.shape[1]):
-                    for k in ti.static(range(3)):
-                        sampled[view, rest, k] = real(0.0)
-                    index[view, rest] = -1
-
-    @ti.kernel
-    def scatter_visible(
-        index: index2, grad_sampled: points3, grad_points: points3, views: ti.i32, spread: ti.i32
-    ):
-        for step in range(grad_points.shape[0] * spread):
-            if step % spread == 0:
-                cloud = step // spread
-                for view in range(cloud * views, cloud * views + views):
-                    for slot in range(index.shape[1]):
-                        i = ti.cast(index[view, slot], ti.i32)
-                        if i >= 0:
-                            for k in ti.static(range(3)):
-                                grad_points[cloud, i, k] = (
-                                    grad_points[cloud, i, k] + grad_sampled[view, slot, k]
-                                )
-
     return SimpleNamespace(
         forward=make_forward(disc=False, serial=False),
         forward_alone=make_forward(disc=False, serial=True),
@@ -324,6 +355,4 @@ def build(real):
         forward_disc_alone=make_forward(disc=True, serial=True),
         merge=merge,
         backward=backward,
-        gather_visible=gather_visible,
-        scatter_visible=scatter_visible,
     )
