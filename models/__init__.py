@@ -2,7 +2,8 @@
 
 from models.autoencoder import LATENT_DIM, Autoencoder, AutoencoderConfig, build_autoencoder
 from models.critic import Critic, critic_loss, generator_loss, gradient_penalty
-from models.generator import CODE_DIM, PROFILES, Generator, GeneratorConfig, Prediction, build_generator
+from models.generator import Generator, Prediction, build_generator
+from models.sizes import CODE_DIM, PROFILES, GeneratorConfig
 
 __all__ = [
     "CODE_DIM",

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from models.autoencoder import LATENT_DIM
-
-if TYPE_CHECKING:
-    from models.generator import Generator, GeneratorConfig
-
-CODE_DIM = 128
+from models.sizes import CODE_DIM, GeneratorConfig
 
 
 def _widen(channels: int, factor: float) -> int:
@@ -142,18 +137,19 @@ def _crop(x: Tensor, like: Tensor) -> Tensor:
     return x[..., : like.shape[-2], : like.shape[-1]]
 
 
-def initialise(model: Generator) -> None:
-    """Keeps the second moment of activations through the layers, and starts clouds small, around the origin.
+def initialise(network: nn.Module) -> None:
+    """Draws the weights of a network of these parts.
 
+    Keeps the second moment of activations through the layers, and starts clouds small, around the origin.
     A layer followed by a ReLU gets variance 2 / fan-in. The layers whose outputs are summed before one ReLU
     get half of it. With the defaults of torch the signal of the image fades through the trunk's eleven layers.
     """
-    decoder = model.decoder
     summed, final = set(), set()
-    if isinstance(decoder, PointDecoder):
-        summed = {decoder.up5, decoder.skip5, decoder.up4, decoder.skip4, decoder.skip3}
-        final = {decoder.fc_points, decoder.conv_points}
-    for module in model.modules():
+    for part in network.modules():
+        if isinstance(part, PointDecoder):
+            summed |= {part.up5, part.skip5, part.up4, part.skip4, part.skip3}
+            final |= {part.fc_points, part.conv_points}
+    for module in network.modules():
         if not isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
             continue
         gain = 0.01 if module in final else 1.0 if module in summed else 2.0

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from models import PROFILES as SIZES
 from models import Autoencoder, AutoencoderConfig, build_autoencoder, build_generator
 from models.autoencoder import AUTOENCODER_PROFILES
-from models.generator import PROFILES as SIZES
 from train.batches import load_split
 from train.checkpoint import best_weights, load_autoencoder, load_generator, save_weights
 from train.config import PROFILES

@@ -213,7 +213,9 @@ class Fit:
             print(f"stopped early and saved; continue with --resume --out {self.out}", file=sys.stderr)
             return 130
         if gather().writes:
-            print(f"trained; see {self.out}, or run: python -m train evaluate {self.out} --data {self.data[0]}")
+            print(
+                f"trained; see {self.out}, or run: python -m train evaluate {self.out} --data {self.data[0]}"
+            )
         return 0
 
 
