@@ -158,10 +158,19 @@ def _project_backward(
         return points.new_zeros(points.shape), projection.new_zeros(projection.shape)
     grad_points = points.new_empty(points.shape)
     grad_projection = projection.new_empty(projection.shape)
-    inputs = points.reshape(-1), projection.reshape(-1), grad_pixels.reshape(-1), grad_depth.reshape(-1)
+    (pixels_flat, pixels_step), (depth_flat, depth_step) = _walk(grad_pixels), _walk(grad_depth)
+    inputs = points.reshape(-1), projection.reshape(-1), pixels_flat, depth_flat
     outputs = grad_points.view(-1), grad_projection.view(-1)
-    _bridge.launch("reproject", "project_backward", points.dtype, *inputs, *outputs, views, count)
+    sizes = pixels_step, depth_step, views, count
+    _bridge.launch("reproject", "project_backward", points.dtype, *inputs, *outputs, *sizes)
     return grad_points, grad_projection
+
+
+def _walk(gradient: Tensor) -> tuple[Tensor, int]:
+    """A flat tensor and the step through it: 0 where one number is expanded, as behind a sum; it is not copied."""
+    if any(gradient.stride()):
+        return gradient.reshape(-1), 1
+    return gradient.as_strided((1,), (1,)), 0
 
 
 def _unproject_fake(depth: Tensor, back_projection: Tensor):

@@ -353,6 +353,19 @@ def test_non_contiguous_clouds_and_expanded_gradients():
     assert torch.equal(strided.grad, dense.grad)
 
 
+def test_the_gradient_of_a_sum_is_that_of_its_ones():
+    """Behind a sum there is one number for all, which is read without a copy."""
+    points, K, cam_from_world = leaves(
+        clouds(torch.float64), cameras(torch.float64).K, cameras(torch.float64).cam_from_world
+    )
+    pixels, depth = dp.project(points, dp.PinholeCamera(K, cam_from_world, HEIGHT, WIDTH))
+    inputs = [points, K, cam_from_world]
+    for weight in (pixels, depth):
+        one = torch.autograd.grad(weight.sum(), inputs, retain_graph=True)
+        ones = torch.autograd.grad(weight, inputs, torch.ones_like(weight), retain_graph=True)
+        assert all(torch.equal(a, b) for a, b in zip(one, ones, strict=True))
+
+
 def test_boundary_points_are_those_that_two_renderers_may_place_differently():
     camera = cameras(torch.float32)
     points = torch.rand(2, 4000, 3, generator=torch.Generator().manual_seed(0)) - 0.5

@@ -69,11 +69,16 @@ def build(real):
         grad_depth: reals,
         grad_points: reals,
         grad_projection: reals,
+        pixels_step: ti.i32,
+        depth_step: ti.i32,
         views: ti.i32,
         count: ti.i32,
         spread: ti.i32,
     ):
-        """One thread owns one cloud and all its views. (`a[i] += x` would be an atomic addition, and slow.)"""
+        """One thread owns one cloud and all its views. (`a[i] += x` would be an atomic addition, and slow.)
+
+        A step of 0 makes of one number the gradient of everything.
+        """
         tiles = count // TILE
         for step in range(points.shape[0] // (3 * count) * spread):
             if step % spread == 0:
@@ -90,9 +95,18 @@ def build(real):
                         x = ti.Vector([points[source + 3 * s] for s in ti.static(range(TILE))])
                         y = ti.Vector([points[source + 3 * s + 1] for s in ti.static(range(TILE))])
                         z = ti.Vector([points[source + 3 * s + 2] for s in ti.static(range(TILE))])
-                        g_u = ti.Vector([grad_pixels[2 * (target + s)] for s in ti.static(range(TILE))])
-                        g_v = ti.Vector([grad_pixels[2 * (target + s) + 1] for s in ti.static(range(TILE))])
-                        g_d = ti.Vector([grad_depth[target + s] for s in ti.static(range(TILE))])
+                        g_u = ti.Vector(
+                            [grad_pixels[2 * (target + s) * pixels_step] for s in ti.static(range(TILE))]
+                        )
+                        g_v = ti.Vector(
+                            [
+                                grad_pixels[(2 * (target + s) + 1) * pixels_step]
+                                for s in ti.static(range(TILE))
+                            ]
+                        )
+                        g_d = ti.Vector(
+                            [grad_depth[(target + s) * depth_step] for s in ti.static(range(TILE))]
+                        )
                         g0, g1, g2 = pull_back(m, x, y, z, g_u, g_v, g_d)
                         x0 += g0 * x
                         y0 += g0 * y
@@ -127,9 +141,9 @@ def build(real):
                             p[0],
                             p[1],
                             p[2],
-                            grad_pixels[2 * target],
-                            grad_pixels[2 * target + 1],
-                            grad_depth[target],
+                            grad_pixels[2 * target * pixels_step],
+                            grad_pixels[(2 * target + 1) * pixels_step],
+                            grad_depth[target * depth_step],
                         )
                         for k in ti.static(range(4)):
                             total[k] += g0 * p[k]
