@@ -120,11 +120,18 @@ def build(real):
                         y2 += g2 * y
                         z2 += g2 * z
                         w2 += g2
+                        grad_x = g0 * m[0] + g1 * m[4] + g2 * m[8]
+                        grad_y = g0 * m[1] + g1 * m[5] + g2 * m[9]
+                        grad_z = g0 * m[2] + g1 * m[6] + g2 * m[10]
+                        if not first:  # once for the whole tile: in each lane it would be a branch
+                            for s in ti.static(range(TILE)):
+                                grad_x[s] += grad_points[source + 3 * s]
+                                grad_y[s] += grad_points[source + 3 * s + 1]
+                                grad_z[s] += grad_points[source + 3 * s + 2]
                         for s in ti.static(range(TILE)):
-                            for k in ti.static(range(3)):
-                                g = g0[s] * m[k] + g1[s] * m[4 + k] + g2[s] * m[8 + k]
-                                at = source + 3 * s + k
-                                grad_points[at] = ti.select(first, g, grad_points[at] + g)
+                            grad_points[source + 3 * s] = grad_x[s]
+                            grad_points[source + 3 * s + 1] = grad_y[s]
+                            grad_points[source + 3 * s + 2] = grad_z[s]
                     total = ti.Vector(
                         [
                             x0.sum(), y0.sum(), z0.sum(), w0.sum(),
