@@ -153,7 +153,10 @@ class PinholeCamera:
     @property
     def batch_shape(self) -> tuple[int, ...]:
         """Leading dimensions of the cameras: (), (V,) or (B, V)."""
-        return tuple(torch.broadcast_shapes(self.K.shape[:-2], self.cam_from_world.shape[:-2]))
+        own, other = self.K.shape[:-2], self.cam_from_world.shape[:-2]
+        if own == other:  # broadcasting would find the same, ten microseconds later
+            return tuple(own)
+        return tuple(torch.broadcast_shapes(own, other))
 
     @property
     def dtype(self) -> torch.dtype:
