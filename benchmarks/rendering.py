@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +18,9 @@ from benchmarks.peers import each, optional
 from diffpoint import reference
 from diffpoint._horizon import BIAS, FILTERS
 from diffpoint.visibility import _DEFAULTS, METHODS, Method
+
+Leaves = tuple[Any, ...]
+"""Points or depths, then the cameras that see them, whose gradients a run leaves behind."""
 
 _BORDER = 0.01
 """Share of the pixels about which two renderers may differ: a point on the border falls into either."""
@@ -249,30 +253,31 @@ def _project(count: int, n: int) -> Race:
 def _project_backward(count: int, n: int) -> Race:
     points, camera = surfaces(count, n), circle_of_cameras(count, 56)
 
-    def ours() -> Tensor:
+    def ours() -> Leaves:
         x, y = leaf(points), leaf_camera(camera)
         pixels, depth = dp.project(x, y)
         (pixels.sum() + depth.sum()).backward()
-        return _gradients(x, y)
+        return x, y
 
-    def in_torch() -> Tensor:
+    def in_torch() -> Leaves:
         x, y = leaf(points), leaf_camera(camera)
         q = torch_peers.project(x, y.projection[:, 0])
         ((q[..., :2] / q[..., 2:]).sum() + q[..., 2].sum()).backward()
-        return _gradients(x, y)
+        return x, y
 
     return Race(
         "project",
         f"{count} x {n}",
-        Contender("diffpoint", ours, lambda g: g),
-        [Contender("torch", in_torch, lambda g: g)],
+        Contender("diffpoint", ours, _gradients),
+        [Contender("torch", in_torch, _gradients)],
         direction="forward + backward",
         units=count,
     )
 
 
-def _gradients(x: Tensor, *cameras: dp.PinholeCamera) -> Tensor:
+def _gradients(descended: Leaves) -> Tensor:
     """Of points or depths, and of the cameras' matrices, in one (B, ...) tensor, each relative to its own size."""
+    x, *cameras = descended
     leaves = [x, *(m for y in cameras for m in (y.K, y.cam_from_world))]
     flat = [gradient(one).flatten(1) for one in leaves if one.grad is not None]
     return torch.cat([g / g.abs().max() for g in flat], 1)
@@ -293,21 +298,21 @@ def _unproject(count: int, size: int) -> Race:
 def _unproject_backward(count: int, size: int) -> Race:
     depth, camera = depth_maps(count, size)
 
-    def ours() -> Tensor:
+    def ours() -> Leaves:
         x, y = leaf(depth), leaf_camera(camera)
         dp.unproject(x, y).points.square().sum().backward()
-        return _gradients(x, y)
+        return x, y
 
-    def in_torch() -> Tensor:
+    def in_torch() -> Leaves:
         x, y = leaf(depth), leaf_camera(camera)
         torch_peers.unproject(x[:, 0], y)[0].square().sum().backward()
-        return _gradients(x, y)
+        return x, y
 
     return Race(
         "unproject",
         f"{count} x {size} x {size}",
-        Contender("diffpoint", ours, lambda g: g),
-        [Contender("torch argsort", in_torch, lambda g: g)],
+        Contender("diffpoint", ours, _gradients),
+        [Contender("torch argsort", in_torch, _gradients)],
         direction="forward + backward",
         units=count,
         tolerance=1e-3,
@@ -341,27 +346,27 @@ def _reproject_backward(count: int, size: int) -> Race:
     depth, camera = depth_maps(count, size)
     target = circle_of_cameras(count, size)[torch.arange(count).roll(1)]
 
-    def ours() -> Tensor:
+    def ours() -> Leaves:
         x, y, z = leaf(depth), leaf_camera(camera), leaf_camera(target)
         seen = dp.reproject(x, y, z)
         foreground = torch.isfinite(seen.depth)
         total = torch.where(foreground[..., None], seen.pixels, 0.0).sum()
         (total + torch.where(foreground, seen.depth, 0.0).sum() + seen.points.sum()).backward()
-        return _gradients(x, y, z)
+        return x, y, z
 
-    def in_torch() -> Tensor:
+    def in_torch() -> Leaves:
         x, y, z = leaf(depth), leaf_camera(camera), leaf_camera(target)
         world, pixels, seen_depth = torch_peers.reproject(x[:, 0], y, z)
         foreground = torch.isfinite(seen_depth)
         total = torch.where(foreground[:, None], pixels, 0.0).sum()
         (total + torch.where(foreground, seen_depth, 0.0).sum() + world.sum()).backward()
-        return _gradients(x, y, z)
+        return x, y, z
 
     return Race(
         "reproject",
         f"{count} x {size} x {size}",
-        Contender("diffpoint", ours, lambda g: g),
-        [Contender("torch", in_torch, lambda g: g)],
+        Contender("diffpoint", ours, _gradients),
+        [Contender("torch", in_torch, _gradients)],
         direction="forward + backward",
         units=count,
         tolerance=1e-3,
