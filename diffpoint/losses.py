@@ -142,11 +142,16 @@ def front_constraint(
     kept = ~empty
     if bool(kept.any()):
         seen, observed = sets.predicted[kept], sets.observed[kept]
-        lengths = {"a_lengths": sets.predicted_lengths[kept], "b_lengths": sets.observed_lengths[kept]}
+        seen_lengths, observed_lengths = sets.predicted_lengths[kept], sets.observed_lengths[kept]
         if distance == "chamfer":
-            value = torch.stack(chamfer_distance(seen, observed, squared=False, **lengths)).sum(0)
+            both = chamfer_distance(
+                seen, observed, squared=False, a_lengths=seen_lengths, b_lengths=observed_lengths
+            )
+            value = both.a_to_b + both.b_to_a
         else:
-            value = earth_mover_distance(seen, observed, tolerance=tolerance, **lengths).cost
+            value = earth_mover_distance(
+                seen, observed, tolerance=tolerance, a_lengths=seen_lengths, b_lengths=observed_lengths
+            ).cost
         loss = loss.masked_scatter(kept, value)
     else:
         loss = loss + 0 * points.sum()  # a gradient of 0, so that a step on such a batch does not fail
