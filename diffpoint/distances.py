@@ -221,7 +221,7 @@ def _search_blocks(a: Blocks, b: Blocks, a_lengths: Tensor, b_lengths: Tensor) -
     """As `_search`, of clouds that have been sorted."""
     squared_distance = a.points.new_empty((len(a_lengths), a.size))
     index = torch.empty(squared_distance.shape, dtype=torch.int64)
-    sets = a.points, a.order, b.points, b.order, b.boxes, b.box_lanes, b.group_lanes, a_lengths, b_lengths
+    sets = a.points, a.order, b.points, b.order, b.boxes, b.box_lanes, b.groups, a_lengths, b_lengths
     _bridge.launch("nearest", "forward_blocks", a.points.dtype, *sets, squared_distance, index)
     return squared_distance, index
 

@@ -65,7 +65,7 @@ def build(real):
                         place = ti.cast((points[cloud, i, k] - low[k]) * scale, ti.i32)
                         code |= spread_bits(ti.max(ti.min(place, cells), 0)) << k
                     key[cloud, i] = code
-                    histogram[cloud, code] += 1
+                    histogram[cloud, code] = histogram[cloud, code] + 1  # not +=, which would be atomic
                 before = 0
                 for cell in range(histogram.shape[1]):
                     here = histogram[cloud, cell]
@@ -80,7 +80,7 @@ def build(real):
                 for i in range(n):
                     box = key[cloud, i]
                     place = box * BLOCK + histogram[cloud, box]
-                    histogram[cloud, box] += 1
+                    histogram[cloud, box] = histogram[cloud, box] + 1
                     order[cloud, place] = i
                     for k in ti.static(range(3)):
                         ordered[cloud, place, k] = points[cloud, i, k]

@@ -11,6 +11,7 @@ from diffpoint.kernels.blocks import BLOCK, GROUP, LANES
 
 CHUNK = 32  # candidates between two updates of the winning chunk
 ROWS = GROUP // LANES  # rows of boxes in a group
+BOX_TILE = 16  # queries that go through the boxes together; 32 are no faster and compile in twice the time
 
 
 def build(real):
@@ -23,16 +24,22 @@ def build(real):
     lanes3 = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=3)
 
     @ti.func
-    def span(x: ti.template(), least, greatest):
-        """Squared distance from each coordinate in `x` to the span from least to greatest; 0 within."""
-        squares = least - x
-        for s in ti.static(range(tile)):
-            below = least - x[s]
-            above = x[s] - greatest
+    def clamped(x, least, greatest):
+        """The coordinate nearest to `x` from least to greatest."""
+        y = ti.select(x < least, least, x)
+        return ti.select(y > greatest, greatest, y)
+
+    @ti.func
+    def gap(corners: ti.template(), cloud, box, low: ti.template(), high: ti.template()):
+        """Squared distance between a box and the box from `low` to `high`."""
+        total = real(0.0)
+        for k in ti.static(range(3)):
+            below = corners[cloud, k, box] - high[k]
+            above = low[k] - corners[cloud, k + 3, box]
             outside = ti.select(below > above, below, above)
             outside = ti.select(outside > 0, outside, real(0.0))
-            squares[s] = outside * outside
-        return squares
+            total += outside * outside
+        return total
 
     @ti.func
     def reached(boxes: ti.template(), cloud, row, low: ti.template(), high: ti.template(), farthest):
@@ -51,24 +58,18 @@ def build(real):
         return bits
 
     @ti.func
-    def most_central(boxes: ti.template(), cloud, start, end, low: ti.template(), high: ti.template()):
-        """Of the boxes in vectors `start` to `end`, the one whose centre is nearest to that of `low` to `high`."""
-        least = ti.Vector([real(ti.math.inf) for s in ti.static(range(LANES))])
-        where = ti.Vector([start for s in ti.static(range(LANES))])
-        for t in range(start, end):
-            d = ti.Vector([real(0.0) for s in ti.static(range(LANES))])
+    def most_central(corners: ti.template(), cloud, start, end, low: ti.template(), high: ti.template()):
+        """Of the boxes `start` to `end`, the one whose centre is nearest to that of `low` to `high`."""
+        least = real(ti.math.inf)
+        best = start
+        for box in range(start, end):
+            d = real(0.0)
             for k in ti.static(range(3)):
-                offset = boxes[cloud, k, t] + boxes[cloud, k + 3, t] - (low[k] + high[k])
+                offset = corners[cloud, k, box] + corners[cloud, k + 3, box] - (low[k] + high[k])
                 d += offset * offset
-            for s in ti.static(range(LANES)):
-                closer = d[s] < least[s]
-                where[s] = ti.select(closer, t, where[s])
-                least[s] = ti.select(closer, d[s], least[s])
-        best = where[0] * LANES
-        for s in ti.static(range(1, LANES)):
-            closer = least[s] < least[0]
-            best = ti.select(closer, where[s] * LANES + s, best)
-            least[0] = ti.select(closer, least[s], least[0])
+            closer = d < least
+            best = ti.select(closer, box, best)
+            least = ti.select(closer, d, least)
         return best
 
     @ti.kernel
@@ -144,7 +145,7 @@ def build(real):
         b_order: orders,
         corners: clouds,
         box_lanes: lanes3,
-        group_lanes: lanes3,
+        groups: clouds,
         a_lengths: integers,
         b_lengths: integers,
         squared_distance: scalars,
@@ -155,64 +156,75 @@ def build(real):
 
         `corners` and `box_lanes` are the same memory: the boxes of `b`.
         """
-        tiles = (squared_distance.shape[1] + tile - 1) // tile
+        tiles = (squared_distance.shape[1] + BOX_TILE - 1) // BOX_TILE
         for step in range(a.shape[0] * tiles * spread):
             if step % spread == 0:
                 work = step // spread
                 cloud = work // tiles
-                first = (work - cloud * tiles) * tile
+                first = (work - cloud * tiles) * BOX_TILE
                 n = ti.cast(a_lengths[cloud], ti.i32)
                 m = ti.cast(b_lengths[cloud], ti.i32)
                 if first < n and m > 0:
-                    ax = ti.Vector([a[cloud, ti.min(first + s, n - 1), 0] for s in ti.static(range(tile))])
-                    ay = ti.Vector([a[cloud, ti.min(first + s, n - 1), 1] for s in ti.static(range(tile))])
-                    az = ti.Vector([a[cloud, ti.min(first + s, n - 1), 2] for s in ti.static(range(tile))])
+                    ax = ti.Vector(
+                        [a[cloud, ti.min(first + s, n - 1), 0] for s in ti.static(range(BOX_TILE))]
+                    )
+                    ay = ti.Vector(
+                        [a[cloud, ti.min(first + s, n - 1), 1] for s in ti.static(range(BOX_TILE))]
+                    )
+                    az = ti.Vector(
+                        [a[cloud, ti.min(first + s, n - 1), 2] for s in ti.static(range(BOX_TILE))]
+                    )
                     low = ti.Vector([ax.min(), ay.min(), az.min()])
                     high = ti.Vector([ax.max(), ay.max(), az.max()])
-                    least = ti.Vector([real(ti.math.inf) for s in ti.static(range(tile))])
-                    winner = ti.Vector([-1 for s in ti.static(range(tile))])
+                    least = ti.Vector([real(ti.math.inf) for s in ti.static(range(BOX_TILE))])
+                    winner = ti.Vector([-1 for s in ti.static(range(BOX_TILE))])
                     farthest = real(ti.math.inf)  # of the nearest found so far, over the tile
                     # First the box in the middle of the tile, then the rest of its group, then the other groups:
                     # what is found first lets most of the rest be passed over.
-                    own_group = most_central(group_lanes, cloud, 0, group_lanes.shape[2], low, high)
-                    own_row = own_group * ROWS
-                    own_box = most_central(box_lanes, cloud, own_row, own_row + ROWS, low, high)
-                    for turn in range(group_lanes.shape[2] + 2):
-                        group_row = ti.select(turn < 2, own_group // LANES, turn - 2)
-                        groups = 1 << (own_group % LANES)
-                        if turn >= 2:
-                            same = ti.select(group_row == own_group // LANES, groups, 0)
-                            groups = reached(group_lanes, cloud, group_row, low, high, farthest) & ~same
-                        for group_step in range(ti.select(groups != 0, LANES * ROWS, 0)):
-                            row = group_row * LANES * ROWS + group_step
-                            boxes = 0
-                            # Where squares overflow even the padding of the groups is within reach.
-                            if (groups >> (group_step // ROWS)) & 1 != 0 and row < box_lanes.shape[2]:
-                                own = ti.select(row == own_box // LANES, 1 << (own_box % LANES), 0)
-                                if turn == 0:
-                                    boxes = own
-                                else:
-                                    boxes = reached(box_lanes, cloud, row, low, high, farthest) & ~own
+                    count = corners.shape[2] // GROUP
+                    own_group = most_central(groups, cloud, 0, count, low, high)
+                    own_box = most_central(
+                        corners, cloud, own_group * GROUP, (own_group + 1) * GROUP, low, high
+                    )
+                    for turn in range(count + 2):
+                        group = ti.select(turn < 2, own_group, turn - 2)
+                        rows = ROWS
+                        if turn >= 2 and (
+                            group == own_group or gap(groups, cloud, group, low, high) > farthest
+                        ):
+                            rows = 0
+                        for row in range(group * ROWS, group * ROWS + rows):
+                            boxes = ti.select(row == own_box // LANES, 1 << (own_box % LANES), 0)
+                            if turn > 0:
+                                boxes = reached(box_lanes, cloud, row, low, high, farthest) & ~boxes
                             for lane in range(ti.select(boxes != 0, LANES, 0)):
                                 box = row * LANES + lane
                                 within = (boxes >> lane) & 1
                                 if within != 0:
-                                    d = span(ax, corners[cloud, 0, box], corners[cloud, 3, box])
-                                    d += span(ay, corners[cloud, 1, box], corners[cloud, 4, box])
-                                    d += span(az, corners[cloud, 2, box], corners[cloud, 5, box])
+                                    least_corner = ti.Vector(
+                                        [corners[cloud, k, box] for k in ti.static(range(3))]
+                                    )
+                                    greatest = ti.Vector(
+                                        [corners[cloud, k + 3, box] for k in ti.static(range(3))]
+                                    )
                                     within = 0
-                                    for s in ti.static(range(tile)):
-                                        within |= ti.select(d[s] <= least[s], 1, 0)
+                                    for s in ti.static(range(BOX_TILE)):
+                                        dx = clamped(ax[s], least_corner[0], greatest[0]) - ax[s]
+                                        dy = clamped(ay[s], least_corner[1], greatest[1]) - ay[s]
+                                        dz = clamped(az[s], least_corner[2], greatest[2]) - az[s]
+                                        within |= ti.select(dx * dx + dy * dy + dz * dz <= least[s], 1, 0)
                                 if within != 0:
-                                    current = ti.Vector([real(ti.math.inf) for s in ti.static(range(tile))])
-                                    source = ti.Vector([-1 for s in ti.static(range(tile))])
+                                    current = ti.Vector(
+                                        [real(ti.math.inf) for s in ti.static(range(BOX_TILE))]
+                                    )
+                                    source = ti.Vector([-1 for s in ti.static(range(BOX_TILE))])
                                     for candidate in range(BLOCK):
                                         j = box * BLOCK + candidate
                                         x = b[cloud, j, 0]
                                         y = b[cloud, j, 1]
                                         z = b[cloud, j, 2]
                                         before_sorting = b_order[cloud, j]
-                                        for s in ti.static(range(tile)):
+                                        for s in ti.static(range(BOX_TILE)):
                                             dx = x - ax[s]
                                             dy = y - ay[s]
                                             dz = z - az[s]
@@ -220,19 +232,24 @@ def build(real):
                                             nearer = e < current[s]
                                             source[s] = ti.select(nearer, before_sorting, source[s])
                                             current[s] = ti.select(nearer, e, current[s])
-                                    for s in ti.static(range(tile)):
+                                    for s in ti.static(range(BOX_TILE)):
                                         # Of equally near ones the one that came first before sorting.
-                                        earlier = (current[s] == least[s]) & (source[s] < winner[s])
-                                        nearer = (current[s] < least[s]) | earlier
-                                        winner[s] = ti.select(nearer, source[s], winner[s])
-                                        least[s] = ti.select(nearer, current[s], least[s])
-                                    farthest = least.max()
-                    for s in ti.static(range(tile)):
-                        if first + s < n:
-                            place = a_order[cloud, first + s]
-                            squared_distance[cloud, place] = least[s]
-                            index[cloud, place] = winner[s]
-                for s in range(tile):
+                                        other = winner[s]
+                                        first_of_equals = ti.select(source[s] < other, source[s], other)
+                                        equal = ti.select(current[s] == least[s], first_of_equals, other)
+                                        nearer = current[s] < least[s]
+                                        source[s] = ti.select(nearer, source[s], equal)
+                                        current[s] = ti.select(nearer, current[s], least[s])
+                                    least = current
+                                    winner = source
+                                    farthest = current.max()
+                    for s in ti.static(
+                        range(BOX_TILE)
+                    ):  # the last point's result more than once, without a branch
+                        place = a_order[cloud, ti.min(first + s, n - 1)]
+                        squared_distance[cloud, place] = least[s]
+                        index[cloud, place] = winner[s]
+                for s in range(BOX_TILE):
                     i = first + s
                     if i < squared_distance.shape[1] and (i >= n or m == 0):
                         squared_distance[cloud, i] = ti.select(i < n, real(ti.math.inf), real(0.0))
@@ -258,7 +275,8 @@ def build(real):
                         g = real(2.0) * grad_squared_distance[cloud, i]
                         for k in ti.static(range(3)):
                             component = g * (a[cloud, i, k] - b[cloud, j, k])
-                            grad_a[cloud, i, k] += component
-                            grad_b[cloud, j, k] -= component
+                            # Not +=, which would be an atomic addition.
+                            grad_a[cloud, i, k] = grad_a[cloud, i, k] + component
+                            grad_b[cloud, j, k] = grad_b[cloud, j, k] - component
 
     return SimpleNamespace(forward=forward, forward_blocks=forward_blocks, backward=backward)

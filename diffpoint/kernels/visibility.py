@@ -343,7 +343,7 @@ def build(real):
                     lower(higher(first_line, second_line), higher(third_line, fourth_line)),
                 )
                 enclosed = w > level + deep
-                ends[c] += ti.select(enclosed, 0, 1)
+                ends[c] = ends[c] + ti.select(enclosed, 0, 1)  # not +=, which would be atomic
                 # The spare place at the end takes the enclosed points: cheaper than a branch nobody can predict.
                 cell[i] = ti.select(enclosed, -1, c)
             else:
@@ -360,7 +360,7 @@ def build(real):
             kept = c >= 0
             c = ti.select(kept, c, first)
             target = ti.select(kept, ends[c], stride - 1)
-            ends[c] += ti.select(kept, 1, 0)
+            ends[c] = ends[c] + ti.select(kept, 1, 0)
             order[slot * stride + target] = i
             packed[slot * stride * 3 + target] = image[at] - low_u
             packed[slot * stride * 3 + stride + target] = (image[at + 1] - low_v) * aspect
