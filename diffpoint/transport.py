@@ -17,6 +17,9 @@ _BIDS_PER_PERSON = 4000
 # The finest bid increment, relative to the extent of the pair: what the prices' number format still resolves.
 _RESOLUTION = {torch.float32: 2e-6, torch.float64: 1e-12}
 
+# Beyond this extent squares and prices would leave float32, and prices reach that of the padding in the kernel.
+_LARGEST_EXTENT = 1e18
+
 
 class Transport(NamedTuple):
     """An assignment between two sets, its cost, and how far from the best it can be."""
@@ -65,7 +68,8 @@ def earth_mover_distance(
     their number); 0 for matched points that coincide.
 
     Raises:
-        ValueError, TypeError: wrong shapes, dtypes or devices, an empty set, NaN or infinite coordinates.
+        ValueError, TypeError: wrong shapes, dtypes or devices, an empty set, NaN or infinite coordinates, or a pair
+            of sets that spans 1e18 or more.
 
     Source: Bertsekas, "The auction algorithm" (1988); CVPR 2019 paper, equation of the EMD, with un-squared
     distances as in its released code.
@@ -173,6 +177,15 @@ def _transport(
     objects = torch.where(swap[:, None, None], a_wide, b_wide)
     person_counts, object_counts = torch.minimum(a_lengths, b_lengths), torch.maximum(a_lengths, b_lengths)
 
+    extent = _extent(persons, person_counts, objects, object_counts)
+    if not bool((extent < _LARGEST_EXTENT).all()):
+        raise _checks.fail(
+            "earth_mover_distance",
+            "a",
+            "span less than 1e18 together with 'b'",
+            f"{extent.max():.3g}",
+            "Scale both down.",
+        )
     axes = lanes(objects)
     # Only differences between prices count; taking off the least keeps them from growing, start after start.
     prices = prices - prices.amin(1, keepdim=True)
@@ -189,7 +202,7 @@ def _transport(
         price_lanes.view(count, -1),
         person_counts,
         object_counts,
-        _extent(persons, person_counts, objects, object_counts),
+        extent,
         known_cost,
         object_of,
         person_of,
@@ -220,7 +233,9 @@ def _extent(persons: Tensor, person_counts: Tensor, objects: Tensor, object_coun
         padding = (torch.arange(cloud.shape[1]) >= counts[:, None])[..., None]
         low.append(cloud.masked_fill(padding, torch.inf).amin(1))
         high.append(cloud.masked_fill(padding, -torch.inf).amax(1))
-    diagonal = (torch.maximum(*high) - torch.minimum(*low)).norm(dim=-1)
+    diagonal = (
+        (torch.maximum(*high) - torch.minimum(*low)).norm(dim=-1, dtype=torch.float64).to(persons.dtype)
+    )
     return diagonal.clamp(min=1e-20)
 
 

@@ -90,3 +90,17 @@ def test_a_wrong_start_is_refused_by_name():
         dp.earth_mover_distance(a, b, start=start._replace(prices=start.prices / 0))
     with pytest.raises(TypeError, match=r"'start.prices' must have the dtype of 'a'"):
         dp.earth_mover_distance(a.float(), b.float(), start=start)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_sets_that_span_too_much_are_refused_and_the_padding_is_not_looked_at(dtype):
+    a, b = clouds(5, 6, dtype)
+    a[1, 4, 2] = 3e19
+    with pytest.raises(ValueError, match=r"earth_mover_distance: 'a' must span less than 1e18 .*3e\+19"):
+        dp.earth_mover_distance(a, b)
+    counted = dp.earth_mover_distance(a, b, a_lengths=torch.tensor([5, 4, 5]))
+    assert counted.converged.all()
+    a[1, 4, 2] = 1e17
+    wide = dp.earth_mover_distance(a, b)
+    exact, _ = reference.earth_mover_distance(a, b)
+    torch.testing.assert_close(wide.cost, exact, rtol=2e-2, atol=0)

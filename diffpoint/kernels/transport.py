@@ -167,7 +167,8 @@ def build(real):
                             weight,
                         )
                         # A single object has no second: its price needs no competition.
-                        price[pair, j] += ti.select(m > 1, next_best - best, real(0.0)) + epsilon
+                        rise = ti.select(m > 1, next_best - best, real(0.0)) + epsilon
+                        price[pair, j] = price[pair, j] + rise  # not +=, which would be an atomic addition
                         outbid = person_of[pair, j]
                         person_of[pair, j] = i
                         object_of[pair, i] = j
