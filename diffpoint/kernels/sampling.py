@@ -82,7 +82,8 @@ def build(real):
         """`points`, `order`, `box_lanes` as sorted by `blocks.sort`; `distance` +inf, and -1 in the padding.
 
         A new point changes distances only in boxes that lie nearer to it than their farthest distance. Equal
-        distances go to the lowest index before sorting, as in the plain algorithm.
+        distances go to the lowest index before sorting, as in the plain algorithm: the first within a box, whose
+        points keep their order.
         """
         for step in range(points.shape[0] * spread):
             if step % spread == 0:
@@ -112,39 +113,33 @@ def build(real):
                                 outside = ti.select(outside > 0, outside, real(0.0))
                                 gap[s] += outside * outside
                         farthest_lanes = box_farthest_lanes[cloud, t]
-                        reached = 0
+                        reached = 0  # a bit for each box
                         for s in ti.static(range(LANES)):
-                            reached += ti.select(gap[s] < farthest_lanes[s], 1, 0)
-                        if reached > 0:
-                            for s in range(LANES):
-                                within = 0
-                                for r in ti.static(range(LANES)):
-                                    within = ti.select((r == s) & (gap[r] < farthest_lanes[r]), 1, within)
-                                if within != 0:
-                                    box = t * LANES + s
-                                    farthest_here = real(-1.0)
-                                    point = box * BLOCK
-                                    for part in range(PARTS):
-                                        row = box * PARTS + part
-                                        dx = x_lanes[cloud, row] - x
-                                        dy = y_lanes[cloud, row] - y
-                                        dz = z_lanes[cloud, row] - z
-                                        to_current = dx * dx + dy * dy + dz * dz
-                                        nearest = distance[cloud, row]
-                                        for r in ti.static(range(LANES)):
-                                            nearest[r] = ti.select(
-                                                to_current[r] < nearest[r], to_current[r], nearest[r]
-                                            )
-                                        distance[cloud, row] = nearest
-                                        for r in ti.static(range(LANES)):
-                                            i = row * LANES + r
-                                            if nearest[r] >= farthest_here:
-                                                lower = order[cloud, i] < order[cloud, point]
-                                                farther = (nearest[r] > farthest_here) | lower
-                                                point = ti.select(farther, i, point)
-                                                farthest_here = nearest[r]
-                                    box_farthest[cloud, box] = farthest_here
-                                    box_point[cloud, box] = point
+                            reached |= ti.select(gap[s] < farthest_lanes[s], 1 << s, 0)
+                        if reached != 0:
+                            while reached != 0:
+                                box = t * LANES + ti.math.popcnt((reached & -reached) - 1)
+                                reached &= reached - 1
+                                farthest_here = real(-1.0)
+                                point = 0
+                                for part in ti.static(range(PARTS)):
+                                    row = box * PARTS + part
+                                    dx = x_lanes[cloud, row] - x
+                                    dy = y_lanes[cloud, row] - y
+                                    dz = z_lanes[cloud, row] - z
+                                    to_current = dx * dx + dy * dy + dz * dz
+                                    nearest = distance[cloud, row]
+                                    for r in ti.static(range(LANES)):
+                                        nearest[r] = ti.select(
+                                            to_current[r] < nearest[r], to_current[r], nearest[r]
+                                        )
+                                    distance[cloud, row] = nearest
+                                    for r in ti.static(range(LANES)):
+                                        farther = nearest[r] > farthest_here
+                                        point = ti.select(farther, part * LANES + r, point)
+                                        farthest_here = ti.select(farther, nearest[r], farthest_here)
+                                box_farthest[cloud, box] = farthest_here
+                                box_point[cloud, box] = box * BLOCK + point
                             farthest_lanes = box_farthest_lanes[cloud, t]
                         for s in ti.static(range(LANES)):
                             farther = farthest_lanes[s] > best_lanes[s]
