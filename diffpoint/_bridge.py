@@ -75,6 +75,15 @@ def _on_the_cpu(function: Callable) -> Callable:
     return run
 
 
+def or_zeros(gradient: Tensor | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """What flows back to an output: one zero, expanded, where nothing does.
+
+    For ops that call `ctx.set_materialize_grads(False)`: torch would otherwise fill a tensor with zeros for every
+    output without a gradient, indices and flags included.
+    """
+    return like.new_zeros(()).expand(shape) if gradient is None else gradient
+
+
 def full_lengths(lengths: Tensor | None, batch: int, size: int, like: Tensor | None = None) -> Tensor:
     """`lengths` as (batch,) int64; full sets, on the device of `like`, where it is None."""
     if lengths is None:

@@ -130,10 +130,13 @@ def _nearest_fake(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor):
 def _nearest_setup(ctx, inputs, output) -> None:
     a, b, *_ = inputs
     ctx.mark_non_differentiable(output[1])
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(a, b, output[1])
 
 
-def _nearest_gradient(ctx, grad_squared_distance: Tensor, _grad_index):
+def _nearest_gradient(ctx, grad_squared_distance: Tensor | None, _grad_index):
+    if grad_squared_distance is None:
+        return (None,) * 4
     a, b, index = ctx.saved_tensors
     return *_nearest_backward(a, b, index, grad_squared_distance), None, None
 
@@ -168,11 +171,14 @@ def _both_setup(ctx, inputs, output) -> None:
     a, b, *_ = inputs
     _, from_a, _, from_b = output
     ctx.mark_non_differentiable(from_a, from_b)
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(a, b, from_a, from_b)
 
 
-def _both_gradient(ctx, grad_from_a: Tensor, _index_a, grad_from_b: Tensor, _index_b):
+def _both_gradient(ctx, grad_from_a: Tensor | None, _index_a, grad_from_b: Tensor | None, _index_b):
     a, b, from_a, from_b = ctx.saved_tensors
+    grad_from_a = _bridge.or_zeros(grad_from_a, a, from_a.shape)
+    grad_from_b = _bridge.or_zeros(grad_from_b, b, from_b.shape)
     return *_nearest_both_backward(a, b, from_a, from_b, grad_from_a, grad_from_b), None, None
 
 

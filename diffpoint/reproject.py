@@ -11,6 +11,8 @@ from torch import Tensor
 from diffpoint import _bridge, _checks
 from diffpoint.camera import PinholeCamera, PointSets, Projection, Views, check_views
 
+_TILE = 8  # as in kernels/reproject.py
+
 
 class Reprojection(NamedTuple):
     """Where the pixels of one camera's depth map are seen by another camera."""
@@ -119,11 +121,15 @@ def _project_fake(points: Tensor, projection: Tensor):
 
 
 def _project_setup(ctx, inputs, output) -> None:
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(*inputs)
 
 
-def _project_gradient(ctx, grad_pixels: Tensor, grad_depth: Tensor):
+def _project_gradient(ctx, grad_pixels: Tensor | None, grad_depth: Tensor | None):
     points, projection = ctx.saved_tensors
+    shape = (*projection.shape[:2], points.shape[1])
+    grad_pixels = _bridge.or_zeros(grad_pixels, points, (*shape, 2))
+    grad_depth = _bridge.or_zeros(grad_depth, points, shape)
     return _project_backward(points, projection, grad_pixels, grad_depth)
 
 
@@ -167,10 +173,10 @@ def _project_backward(
 
 
 def _walk(gradient: Tensor) -> tuple[Tensor, int]:
-    """A flat tensor and the step through it: 0 where one number is expanded, as behind a sum; it is not copied."""
+    """A flat tensor and the step through it: 0 for one number expanded, as behind a sum, of which a tile is made."""
     if any(gradient.stride()):
         return gradient.reshape(-1), 1
-    return gradient.as_strided((1,), (1,)), 0
+    return gradient.as_strided((3 * _TILE,), (0,)).contiguous(), 0
 
 
 def _unproject_fake(depth: Tensor, back_projection: Tensor):
@@ -183,10 +189,13 @@ def _unproject_fake(depth: Tensor, back_projection: Tensor):
 
 def _unproject_setup(ctx, inputs, output) -> None:
     ctx.mark_non_differentiable(output[1])
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(*inputs)
 
 
-def _unproject_gradient(ctx, grad_points: Tensor, _grad_lengths):
+def _unproject_gradient(ctx, grad_points: Tensor | None, _grad_lengths):
+    if grad_points is None:
+        return None, None
     depth, back_projection = ctx.saved_tensors
     return _unproject_backward(depth, back_projection, grad_points)
 
@@ -241,11 +250,17 @@ def _reproject_fake(depth: Tensor, back_projection: Tensor, projection: Tensor, 
 
 def _reproject_setup(ctx, inputs, output) -> None:
     ctx.mark_non_differentiable(output[3])
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(*inputs[:3])
 
 
-def _reproject_gradient(ctx, grad_points: Tensor, grad_pixels: Tensor, grad_seen: Tensor, _grad_valid):
+def _reproject_gradient(
+    ctx, grad_points: Tensor | None, grad_pixels: Tensor | None, grad_seen: Tensor | None, _grad_valid
+):
     depth, back_projection, projection = ctx.saved_tensors
+    grad_points = _bridge.or_zeros(grad_points, depth, (*depth.shape, 3))
+    grad_pixels = _bridge.or_zeros(grad_pixels, depth, (*depth.shape, 2))
+    grad_seen = _bridge.or_zeros(grad_seen, depth, depth.shape)
     gradients = _reproject_backward(depth, back_projection, projection, grad_points, grad_pixels, grad_seen)
     return *gradients, None, None
 
@@ -254,7 +269,6 @@ def _reproject_gradient(ctx, grad_points: Tensor, grad_pixels: Tensor, grad_seen
 def _reproject(
     depth: Tensor, back_projection: Tensor, projection: Tensor, height: int, width: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    check_depth("reproject", "depth", depth)
     batch, views, rows, columns = depth.shape
     points = depth.new_empty((*depth.shape, 3))
     pixels = depth.new_empty((*depth.shape, 2))
@@ -267,6 +281,7 @@ def _reproject(
         sizes = rows, columns, height, width
         _bridge.launch("reproject", "reproject", depth.dtype, *inputs, *outputs, *sizes)
         if not math.isfinite(float(total.sum())):
+            check_depth("reproject", "depth", depth)
             _checks.check_finite("reproject", "points", points)
     return points, pixels, seen, valid.view(torch.bool)
 
@@ -290,9 +305,11 @@ def _reproject_backward(
     inputs = depth, back_projection, projection
     grad_depth, grad_back_projection, grad_projection = (x.new_empty(x.shape) for x in inputs)
     if depth.numel():
-        gradients = grad_depth, grad_back_projection, grad_projection
-        flat = [x.reshape(-1) for x in (*inputs, grad_points, grad_pixels, grad_seen, *gradients)]
-        _bridge.launch("reproject", "reproject_backward", depth.dtype, *flat, *depth.shape[2:])
+        gradients, steps = zip(*(_walk(g) for g in (grad_points, grad_pixels, grad_seen)), strict=True)
+        outputs = grad_depth.view(-1), grad_back_projection.view(-1), grad_projection.view(-1)
+        flat = [x.reshape(-1) for x in inputs]
+        sizes = *steps, *depth.shape[2:]
+        _bridge.launch("reproject", "reproject_backward", depth.dtype, *flat, *gradients, *outputs, *sizes)
     return grad_depth, grad_back_projection, grad_projection
 
 

@@ -52,10 +52,13 @@ def _fake(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, with_gradi
 
 def _setup(ctx, inputs, output) -> None:
     ctx.mark_non_differentiable(*output[1:])
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(*output[1:])
 
 
-def _gradient(ctx, grad_cost: Tensor, *_grads):
+def _gradient(ctx, grad_cost: Tensor | None, *_grads):
+    if grad_cost is None:
+        return (None,) * 5
     unit_a, unit_b = ctx.saved_tensors
     return grad_cost[:, None, None] * unit_a, grad_cost[:, None, None] * unit_b, None, None, None
 

@@ -79,10 +79,13 @@ def _splat_setup(ctx, inputs, output) -> None:
     points, _, projection, *_ = inputs
     _, index, visible = output
     ctx.mark_non_differentiable(index, visible)
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(points, projection, index)
 
 
-def _splat_gradient(ctx, grad_depth: Tensor, _grad_index, _grad_visible):
+def _splat_gradient(ctx, grad_depth: Tensor | None, _grad_index, _grad_visible):
+    if grad_depth is None:
+        return (None,) * 6
     points, projection, index = ctx.saved_tensors
     grad_points, grad_projection = _splat_backward(points, projection, index, grad_depth)
     return grad_points, None, grad_projection, None, None, None

@@ -133,10 +133,13 @@ def _transport_fake(
 def _transport_setup(ctx, inputs, output) -> None:
     a, b, a_lengths, b_lengths, *_ = inputs
     ctx.mark_non_differentiable(*output[1:])
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(a, b, output[1], torch.minimum(a_lengths, b_lengths))
 
 
-def _transport_gradient(ctx, grad_cost: Tensor, *_grads):
+def _transport_gradient(ctx, grad_cost: Tensor | None, *_grads):
+    if grad_cost is None:
+        return (None,) * 7
     a, b, assignment, matched = ctx.saved_tensors
     return *_transport_backward(a, b, assignment, grad_cost / matched), None, None, None, None, None
 

@@ -82,11 +82,14 @@ def _sample_fake(points: Tensor, visible: Tensor):
 
 def _sample_setup(ctx, inputs, output) -> None:
     ctx.mark_non_differentiable(output[1], output[2])
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(output[1])
     ctx.count = inputs[0].shape[1]
 
 
-def _sample_gradient(ctx, grad_points: Tensor, _grad_index, _grad_lengths):
+def _sample_gradient(ctx, grad_points: Tensor | None, _grad_index, _grad_lengths):
+    if grad_points is None:
+        return None, None
     return _sample_view_backward(ctx.saved_tensors[0], grad_points, ctx.count), None
 
 

@@ -305,6 +305,33 @@ def test_reproject_equals_its_twin(dtype):
     assert_close(x, y, scale=500)
 
 
+@pytest.mark.parametrize("outputs", [(0,), (1,), (2,), (0, 2)])
+def test_reproject_passes_back_the_gradient_of_a_sum_of_some_outputs(outputs):
+    """A sum's gradient is one number expanded, and outputs left alone have none."""
+    shape, generator = (2, 3, HEIGHT, WIDTH), torch.Generator().manual_seed(3)
+    near = 1.7 + 0.6 * torch.rand(shape, generator=generator, dtype=torch.float64)  # before every target
+    source, target = cameras(torch.float64), cameras(torch.float64)[:, [1, 2, 0]]
+    inputs = leaves(near, source.K, source.cam_from_world, target.K, target.cam_from_world)
+    depth, *matrices = inputs
+    ours = dp.reproject(
+        depth,
+        dp.PinholeCamera(matrices[0], matrices[1], HEIGHT, WIDTH),
+        dp.PinholeCamera(matrices[2], matrices[3], HEIGHT, WIDTH),
+    )
+    theirs = reference.reproject(
+        depth, (matrices[0], matrices[1]), (matrices[2], matrices[3]), (HEIGHT, WIDTH)
+    )
+    assert bool(torch.isfinite(ours.pixels).all())
+
+    def descended(results) -> list[Tensor]:
+        total = torch.stack([results[i].sum() for i in outputs]).sum()
+        return list(torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True))
+
+    for x, y in zip(descended(ours), descended(theirs), strict=True):
+        x, y = (g if g.shape == shape else g[..., :-1, :] for g in (x, y))
+        assert_close(x, y, scale=max(1.0, 1000 * float(y.abs().max())))
+
+
 def test_reprojecting_into_the_same_camera_returns_the_pixel_centres():
     camera = cameras(torch.float64)
     depth = depth_maps(torch.float64)
