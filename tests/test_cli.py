@@ -17,6 +17,7 @@ from PIL import Image
 
 from train.__main__ import main
 from train.config import fit_config_from_json
+from train.data.procedural import generate
 from train.errors import UserError
 from train.images import on_dark, read_images
 from train.runs import open_run
@@ -133,6 +134,18 @@ def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("train.runs._SHIPPED", tmp_path / "shipped")
     return tmp_path / "shipped" / "generator.safetensors"
+
+
+def test_the_weights_that_come_with_the_repository_know_shapes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    generate(Path("data"), shapes=10, categories=["chair", "car"], seed=7, size=56, views=4, processes=1)
+    command = ["evaluate", "pretrained", "--data", "data", "--views", "1", "4", "--seeds", "0"]
+    assert main([*command, "--out", "scores.json"]) == 0
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert scores["profile"] == "cpu"
+    assert scores["views"]["4"]["cd"] < min(scores["views"]["1"]["cd"], scores["medoid"]["cd"])
 
 
 def test_the_word_pretrained_says_what_is_missing(
