@@ -81,7 +81,7 @@ def test_it_tells_real_codes_from_scrambled_ones() -> None:
     torch.manual_seed(0)
     autoencoder, critic = build_autoencoder("smoke"), Critic()
     with torch.no_grad():
-        for _ in range(40):
+        for _ in range(80):
             autoencoder(_boxes(16))
     autoencoder.freeze()
     optimiser = torch.optim.Adam(critic.parameters())
@@ -137,17 +137,17 @@ def test_n_critic_and_the_real_pool_are_heard(tiny_data: Path, smoke_run: Path) 
     assert len(steps) == 3
 
 
-@pytest.mark.slow
 def test_scores_of_predictions_rise_when_the_critic_is_heard(tiny_data: Path, smoke_run: Path) -> None:
-    """Two trainings that differ in the critic's weight alone: heeded, it ends up finding less to tell apart."""
+    """Against a critic that stands still, so that a rise is the generator's doing alone."""
     split = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, progress=False)
-    gaps = {}
-    for gamma in (1e-6, 5.0):
+    rises = {}
+    for gamma in (1e-6, 1e4):
         stage = dataclasses.replace(
-            _SMOKE.stage1, steps=200, n_critic=5, critic_learning_rate=1e-3, gamma=gamma
+            _SMOKE.stage1, steps=80, warmup=0, beta=0.0, gamma=gamma, critic_learning_rate=0.0
         )
         training = Training(dataclasses.replace(_SMOKE, stage1=stage), split)
         training.begin_phase("stage1", smoke_run)
-        reports = [training.advance() for _ in range(200)]
-        gaps[gamma] = torch.stack([r["real_score"] - r["fake_score"] for r in reports[-50:]]).mean().item()
-    assert 0 < gaps[5.0] < 0.7 * gaps[1e-6]
+        scores = torch.stack([training.advance()["fake_score"] for _ in range(80)])
+        rises[gamma] = (scores[-5:].mean() - scores[:5].mean()).item()
+    assert rises[1e4] > 0
+    assert rises[1e4] > rises[1e-6] + 0.02  # unheeded, it falls by 0.03 to 0.04
