@@ -75,33 +75,34 @@ def _excess(count: int, a: Tensor, b: Tensor) -> str:
     return f"{float((costs / least - 1).mean()):.3%} above exact"
 
 
+def _descend(cost: Callable[[Tensor, Tensor], Tensor], a: Tensor, b: Tensor) -> Callable[[], Tensor]:
+    """A run of a cost, forward and backward; its result is the gradient to `a`."""
+
+    def run() -> Tensor:
+        x, y = leaf(a), leaf(b)
+        cost(x, y).sum().backward()
+        return gradient(x)
+
+    return run
+
+
 def _transport_backward(count: int, n: int) -> Race:
     a, b = pairs(count, n, n)
 
-    def descend(cost: Callable[[Tensor, Tensor], Tensor], some: slice) -> Callable[[], Tensor]:
-        def run() -> Tensor:
-            x, y = leaf(a[some]), leaf(b[some])
-            cost(x, y).sum().backward()
-            return gradient(x)
-
-        return run
-
-    one = slice(0, 1)
+    one = a[:1], b[:1]
     peers = []
     if ot := optional("ot"):
         weights = torch.full((n,), 1 / n, dtype=torch.float64)
         cost = lambda x, y: ot.emd2(weights, weights, torch.cdist(x[0].double(), y[0].double()))  # noqa: E731
         remark = "exact, one core; partners that cost the same differ"
-        peers.append(Contender("POT emd2", descend(cost, one), lambda g: g, remark, 1))
+        peers.append(Contender("POT emd2", _descend(cost, *one), lambda g: g, remark, 1))
     if geomloss := optional("geomloss"):
         sinkhorn = geomloss.SamplesLoss("sinkhorn", p=1, blur=0.005, debias=False, backend="tensorized")
-        peers.append(Contender("geomloss", descend(sinkhorn, one), lambda g: g, "approximates", 1))
+        peers.append(Contender("geomloss", _descend(sinkhorn, *one), lambda g: g, "approximates", 1))
     return Race(
         "earth_mover_distance",
         f"{count} x {n}",
-        Contender(
-            "diffpoint", descend(lambda x, y: dp.earth_mover_distance(x, y).cost, slice(None)), lambda g: g
-        ),
+        Contender("diffpoint", _descend(lambda x, y: dp.earth_mover_distance(x, y).cost, a, b), lambda g: g),
         peers,
         direction="forward + backward",
         units=count,
@@ -135,19 +136,11 @@ def _soft(count: int, n: int) -> Race:
 def _soft_backward(count: int, n: int) -> Race:
     a, b = pairs(count, n, n)
 
-    def descend(cost: Callable[[Tensor, Tensor], Tensor], some: slice) -> Callable[[], Tensor]:
-        def run() -> Tensor:
-            x, y = leaf(a[some]), leaf(b[some])
-            cost(x, y).sum().backward()
-            return gradient(x)
-
-        return run
-
     return Race(
         "approxmatch",
         f"{count} x {n}",
-        Contender("diffpoint", descend(dp.approxmatch, slice(None)), lambda g: g),
-        [Contender("torch", descend(reference.approxmatch, slice(0, 1)), lambda g: g, units=1)],
+        Contender("diffpoint", _descend(dp.approxmatch, a, b), lambda g: g),
+        [Contender("torch", _descend(reference.approxmatch, a[:1], b[:1]), lambda g: g, units=1)],
         direction="forward + backward",
         units=count,
         tolerance=1e-3,

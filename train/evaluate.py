@@ -29,7 +29,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from models import Generator
-from train.batches import LoadedSplit, load_split
+from train.batches import LoadedSplit
 from train.config import FitConfig
 from train.errors import UserError
 from train.files import write_text
@@ -77,13 +77,14 @@ def evaluate(
     """
     begun = time.monotonic()
     _check(seeds, views, limit)
-    model, config, folder = open_run(run)
+    opened = open_run(run)
+    model, config, folder = opened
     if out is None:
         if folder is None:
             raise UserError(f"say where to write with --out FILE: {run} belongs to the repository")
         out = folder / "evaluation.json"
-    test = _load(data, split, model, config, limit=limit, progress=progress)
-    train = _load(data, "train", model, config, limit=None, progress=progress)
+    test = opened.load_split(data, split, limit=limit, progress=progress)
+    train = opened.load_split(data, "train", progress=progress)
     counts = sorted({n for n in views if n <= test.views})
     if not counts:
         raise UserError(f"{data} has {test.views} views per shape; none of {list(views)} can be evaluated")
@@ -233,24 +234,3 @@ def _one_image_per_shape(test: LoadedSplit) -> Tensor:
     """Up to 24 images of as many shapes as there are; a lone shape shows two of its views."""
     numbers = torch.arange(max(2, min(_SENSITIVITY_IMAGES, len(test))))
     return test.float_images(numbers % len(test), (numbers // len(test))[:, None] % test.views)[:, 0]
-
-
-def _load(
-    data: Path,
-    split: Literal["train", "val", "test"],
-    model: Generator,
-    config: FitConfig,
-    *,
-    limit: int | None,
-    progress: bool,
-) -> LoadedSplit:
-    return load_split(
-        data,
-        split,
-        image_size=(model.config.image_height, model.config.image_width),
-        map_size=config.map_size,
-        gt_pool=config.gt_pool,
-        categories=config.categories,
-        limit=limit,
-        progress=progress,
-    )

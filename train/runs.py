@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from models import Generator
+from train.batches import LoadedSplit, load_split
 from train.checkpoint import config_of, load_generator
 from train.config import FitConfig
 from train.errors import UserError
@@ -24,6 +25,26 @@ class OpenRun(NamedTuple):
     model: Generator
     config: FitConfig
     folder: Path | None
+
+    def load_split(
+        self,
+        data: Path,
+        split: Literal["train", "val", "test"],
+        *,
+        limit: int | None = None,
+        progress: bool = True,
+    ) -> LoadedSplit:
+        """Reads a split as the run was trained: its image and map sizes, its categories."""
+        return load_split(
+            data,
+            split,
+            image_size=(self.model.config.image_height, self.model.config.image_width),
+            map_size=self.config.map_size,
+            gt_pool=self.config.gt_pool,
+            categories=self.config.categories,
+            limit=limit,
+            progress=progress,
+        )
 
 
 def open_run(run: Path) -> OpenRun:

@@ -24,7 +24,7 @@ from tqdm import tqdm
 from diffpoint import consistency_loss
 from models import Generator
 from train import figures
-from train.batches import LoadedSplit, load_split
+from train.batches import LoadedSplit
 from train.config import InferenceConfig
 from train.errors import UserError
 from train.files import write_text
@@ -84,20 +84,11 @@ def agreement(
     Returns:
         What agreement.json holds.
     """
-    model, config, _ = open_run(run)
+    opened = open_run(run)
+    model, config = opened.model, opened.config
     if model.config.deterministic:
         raise UserError(f"{run} takes no codes: there is nothing to agree on by choosing them")
-    size = (model.config.image_height, model.config.image_width)
-    test = load_split(
-        data,
-        "test",
-        image_size=size,
-        map_size=config.map_size,
-        gt_pool=config.gt_pool,
-        categories=config.categories,
-        limit=limit,
-        progress=progress,
-    )
+    test = opened.load_split(data, "test", limit=limit, progress=progress)
     if not 2 <= views <= test.views:
         raise UserError(f"--views must be between 2 and the {test.views} that {data} has; got {views}")
     if len(test) < 2:
