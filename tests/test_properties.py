@@ -123,7 +123,7 @@ def test_agrees_with_its_twin_or_refuses_at_length(name, record_property):
     outcomes = throw_at(name, largest=3000, examples=EXAMPLES)
     record_property("cases", outcomes.total())
     assert outcomes[AGREED] >= 30
-    assert outcomes[REFUSED] >= 1
+    assert outcomes[REFUSED] >= 3
 
 
 def test_every_op_is_thrown_at():
