@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 from tyro.constructors import PrimitiveConstructorSpec
 
 from train.config import PROFILES, FitConfig, fit_config_from_json, with_steps, with_variant
+from train.data_commands import Data
 from train.errors import UserError
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
@@ -40,146 +41,6 @@ Numbers = Annotated[
     ),
 ]
 """Whole numbers, given as `1,2,4` or as `1 2 4`."""
-
-
-@dataclasses.dataclass
-class Procedural:
-    """Generate shapes with designed ambiguity: what one view hides, it truly leaves open."""
-
-    out: Path
-    """Directory of the new data tree."""
-    shapes: int = 400
-    """How many shapes, over all categories."""
-    categories: tuple[str, ...] = ()
-    """Families to draw from, for instance `chair display`; none means all thirteen."""
-    seed: int = 0
-    """The same seed gives the same tree."""
-    size: int = 224
-    """Side of the renders in pixels; 112 is enough for the cpu profile."""
-    views: int = 8
-    """Views per shape."""
-
-    def run(self) -> None:
-        from train.data.procedural import generate
-
-        report = generate(
-            self.out,
-            shapes=self.shapes,
-            categories=self.categories or None,
-            seed=self.seed,
-            size=self.size,
-            views=self.views,
-        )
-        print(report.summary())
-
-
-@dataclasses.dataclass
-class Meshes:
-    """Render meshes into a data tree: OBJ, GLB, PLY or OFF in folders, zips, .sh3f libraries or ShapeNet trees."""
-
-    sources: Positional[tuple[Path, ...]]
-    """Mesh files, folders, zips or .sh3f libraries."""
-    out: Path
-    """Directory of the new data tree."""
-    labels: Path | None = None
-    """CSV that names the category of each mesh; only labelled meshes are taken then."""
-    size: int = 224
-    """Side of the renders in pixels; 112 is enough for the cpu profile."""
-    views: int = 8
-    """Views per mesh."""
-    seed: int = 0
-    """Seeds cameras, surface samples and the split."""
-
-    def run(self) -> None:
-        from train.data.meshes import convert
-
-        report = convert(
-            self.sources, self.out, labels=self.labels, size=self.size, views=self.views, seed=self.seed
-        )
-        print(report.summary())
-
-
-@dataclasses.dataclass
-class Check:
-    """Look through a data tree: what is there, what is broken, whether cameras, depth and clouds agree."""
-
-    data: Positional[Path]
-    """Root of the data tree."""
-
-    def run(self) -> int:
-        from train.data.check import check_tree
-
-        report = check_tree(self.data)
-        print(report.summary())
-        return 1 if report.problems else 0
-
-
-@dataclasses.dataclass
-class Show:
-    """Draw a contact sheet for each category of a data tree: views, depth, and the cloud from front and back."""
-
-    data: Positional[Path]
-    """Root of the data tree."""
-    out: Path | None = None
-    """Folder of the sheets; contact/ in the data tree if not given."""
-    categories: tuple[str, ...] = ()
-    """Categories to draw; none means all."""
-    shapes: int = 8
-    """Rows of a sheet."""
-
-    def run(self) -> None:
-        from train.data.show import show
-
-        for category, path in show(
-            self.data, self.out, categories=self.categories or None, shapes=self.shapes
-        ).items():
-            print(f"{category}: {path}")
-
-
-@dataclasses.dataclass
-class Rules:
-    """Measure whether the fronts of the families hide their backs; see docs/families.md."""
-
-    data: Path | None = None
-    """Measure every object of this procedural data tree, not fresh ones."""
-    categories: tuple[str, ...] = ()
-    """Families to measure; none means all that have designed ambiguity."""
-    objects: int = 20
-    """Objects of each family."""
-    seed: int = 0
-    """Draws the objects."""
-    pictures: Path | None = None
-    """Folder for a picture of each family, front and backs; of all thirteen if no categories are given."""
-
-    def run(self) -> int:
-        from train.data.families import FAMILIES
-        from train.data.portraits import draw_families
-        from train.data.rules import measure, measure_tree
-
-        if self.pictures is not None:
-            draw_families(self.pictures, self.categories or tuple(FAMILIES), seed=self.seed)
-        if self.data is not None:
-            report = measure_tree(self.data)
-        else:
-            report = measure(self.categories or None, objects=self.objects, seed=self.seed)
-        print(report.summary())
-        return 1 if report.broken else 0
-
-
-@dataclasses.dataclass
-class Data:
-    """Make a data tree, or look through one."""
-
-    action: OmitArgPrefixes[
-        Annotated[Procedural, subcommand("procedural")]
-        | Annotated[Meshes, subcommand("meshes")]
-        | Annotated[Check, subcommand("check")]
-        | Annotated[Show, subcommand("show")]
-        | Annotated[Rules, subcommand("rules")]
-    ]
-
-    def run(self) -> int | None:
-        return self.action.run()
 
 
 @dataclasses.dataclass
