@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import hashlib
+import math
 import re
 import shutil
 import unicodedata
@@ -12,6 +13,8 @@ import zipfile
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
+
+import numpy as np
 
 from train.data.categories import CATEGORY_OF, SYNSET_OF, UNKNOWN, synset_of
 from train.data.store import CLOUDS
@@ -59,6 +62,8 @@ class Label:
     library: str
     model: str
     synset: str
+    turn: Rotation | None = None
+    """What stands the model upright and facing +z where its library's own rotation does not."""
 
 
 def find_meshes(sources: Sequence[Path], scratch: Path) -> tuple[list[MeshFile], dict[str, str]]:
@@ -156,10 +161,13 @@ def _catalogue_rotations(folder: Path) -> dict[str, Rotation]:
 
 
 def read_labels(path: Path) -> list[Label]:
-    """Read a label file with the columns library, model and category (and synset, where the category has one).
+    """Read a label file with the columns library, model and category, and where wanted synset and turn.
+
+    A turn is an axis and the degrees by which a model is turned about it, after its library's own rotation: with `x90`
+    a telephone that lies on its back stands up and faces +z.
 
     Raises:
-        UserError: no such file, or no such columns.
+        UserError: no such file, no such columns, or a turn that is none.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -172,9 +180,37 @@ def read_labels(path: Path) -> list[Label]:
     if missing:
         raise UserError(f"the label file {path} has no column {', '.join(missing)}, or no lines")
     return [
-        Label(row["library"], row["model"], row.get("synset") or synset_of(row["category"].strip()))
+        Label(
+            row["library"],
+            row["model"],
+            row.get("synset") or synset_of(row["category"].strip()),
+            _turn_of(row.get("turn") or "", f"{path}: {row['model']}"),
+        )
         for row in rows
     ]
+
+
+def _turn_of(text: str, where: str) -> Rotation | None:
+    """The matrix, row by row, of a turn such as `y-90`: about y by -90 degrees, right-handed."""
+    if not text.strip():
+        return None
+    parts = re.fullmatch(r"([xyz])(-?\d+)", text.strip())
+    if parts is None:
+        raise UserError(f"{where}: the turn {text!r} is no axis and degrees such as y90")
+    angle = math.radians(int(parts[2]))
+    first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[parts[1]]
+    matrix = np.eye(3)
+    matrix[first, first] = matrix[second, second] = round(math.cos(angle), 12)
+    matrix[second, first] = round(math.sin(angle), 12)
+    matrix[first, second] = -matrix[second, first]
+    return tuple(matrix.ravel().tolist())
+
+
+def _followed_by(rotation: Rotation | None, turn: Rotation | None) -> Rotation | None:
+    """Both, one after the other, as one."""
+    if rotation is None or turn is None:
+        return rotation or turn
+    return tuple((np.reshape(turn, (3, 3)) @ np.reshape(rotation, (3, 3))).ravel().tolist())
 
 
 def keep_labelled(
@@ -191,7 +227,8 @@ def keep_labelled(
     for label in labels:
         mesh = by_place.get((label.library, label.model))
         if mesh is not None:
-            kept.append(dataclasses.replace(mesh, synset=label.synset))
+            turned = _followed_by(mesh.rotation, label.turn)
+            kept.append(dataclasses.replace(mesh, synset=label.synset, rotation=turned))
         elif label.library in libraries:
             absent[f"{label.library}: {label.model}"] = (
                 "the label file names it, its library does not have it"
