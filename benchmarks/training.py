@@ -142,9 +142,9 @@ def twins(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
         return dp.Chamfer(*reference.chamfer_distance(a, b, **options))
 
     def earth_mover_distance(
-        a: Tensor, b: Tensor, *, tolerance: float = 0.0, **lengths: Tensor
+        a: Tensor, b: Tensor, *, tolerance: float = 0.0, enough: Tensor | None = None, **lengths: Tensor
     ) -> dp.Transport:
-        del tolerance  # the twin is exact
+        del tolerance, enough  # the twin is exact
         cost, assignment = reference.earth_mover_distance(a, b, **lengths)
         prices = a.new_zeros((*cost.shape, max(a.shape[-2], b.shape[-2])))
         converged = torch.ones_like(cost, dtype=torch.bool)

@@ -233,8 +233,10 @@ def diversity_loss(
     if not torch.compiler.is_compiling():
         _checks.check_finite("diversity_loss", "codes", codes.detach())
     first, second = _pairs("diversity_loss", "codes", codes.shape[0])
-    moved = earth_mover_distance(clouds[first], clouds[second], tolerance=tolerance).cost
     apart = (codes[first] - codes[second]).norm(dim=-1)
+    # Shapes that have been proven to differ enough cost nothing, however much they differ.
+    enough = apart / alpha if alpha > 0 else None
+    moved = earth_mover_distance(clouds[first], clouds[second], tolerance=tolerance, enough=enough).cost
     return _reduce("diversity_loss", torch.relu(apart - alpha * moved).mean(0), reduction)
 
 

@@ -31,7 +31,7 @@ class Transport(NamedTuple):
     bound: Tensor
     """(*B) `cost` exceeds the least possible cost by at most this."""
     converged: Tensor
-    """(*B) bool: the tolerance was reached, or the resolution of the number format."""
+    """(*B) bool: the tolerance was reached, or the resolution of the number format, or `enough` was proven."""
     prices: Tensor
     """(*B, max(N, M)) of the points of the larger set, at least 0: a `start` for a pair like this one."""
 
@@ -42,6 +42,7 @@ def earth_mover_distance(
     *,
     tolerance: float = 0.02,
     start: Transport | None = None,
+    enough: Tensor | None = None,
     a_lengths: Tensor | None = None,
     b_lengths: Tensor | None = None,
 ) -> Transport:
@@ -57,6 +58,8 @@ def earth_mover_distance(
         start: the result for sets of these sizes in the same order that have moved a little since, as from one step
             of a descent to the next: its prices make the auction two to five times faster. What is promised holds
             whatever they are.
+        enough: (*B) where the least cost is proven to be at least this, the auction ends, and `cost` is only known to
+            be no less: for a hinge, which is 0 from there on. The proof is cheap where the clouds are far apart.
         a_lengths: (*B) int64, how many of the N points count; default all.
         b_lengths: (*B) int64, how many of the M points count; default all.
 
@@ -85,8 +88,14 @@ def earth_mover_distance(
     if not 0 < tolerance < 1:
         raise _checks.fail(name, "tolerance", "lie between 0 and 1", repr(tolerance))
     prices, known_cost = _start(name, start, a, b)
+    if enough is None:
+        limit = a.new_full((a3.shape[0],), torch.inf)
+    else:
+        _checks.check_tensor(name, "enough", enough, batch)
+        _checks.check_same_dtype(name, a=a, enough=enough)
+        limit = enough.detach().reshape(-1)
     cost, assignment, bound, converged, prices = _transport(
-        a3, b3, la, lb, prices, known_cost, float(tolerance)
+        a3, b3, la, lb, prices, known_cost, limit, float(tolerance)
     )
     return Transport(
         cost.reshape(batch),
@@ -118,6 +127,7 @@ def _transport_fake(
     b_lengths: Tensor,
     prices: Tensor,
     known_cost: Tensor,
+    enough: Tensor,
     tolerance: float,
 ):
     count = a.shape[0]
@@ -139,9 +149,9 @@ def _transport_setup(ctx, inputs, output) -> None:
 
 def _transport_gradient(ctx, grad_cost: Tensor | None, *_grads):
     if grad_cost is None:
-        return (None,) * 7
+        return (None,) * 8
     a, b, assignment, matched = ctx.saved_tensors
-    return *_transport_backward(a, b, assignment, grad_cost / matched), None, None, None, None, None
+    return *_transport_backward(a, b, assignment, grad_cost / matched), None, None, None, None, None, None
 
 
 @_bridge.register(
@@ -154,6 +164,7 @@ def _transport(
     b_lengths: Tensor,
     prices: Tensor,
     known_cost: Tensor,
+    enough: Tensor,
     tolerance: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     _checks.check_sets("earth_mover_distance", a, b, a_lengths, b_lengths, smallest=1)
@@ -207,6 +218,7 @@ def _transport(
         object_counts,
         extent,
         known_cost,
+        enough,
         object_of,
         person_of,
         queue,

@@ -27,7 +27,7 @@ def operator_arguments() -> dict[str, tuple]:
         "project": (a, projection),
         "unproject": (depth, camera.back_projection.clone().requires_grad_()),
         "reproject": (depth, camera.back_projection.clone().requires_grad_(), projection, H, W),
-        "earth_mover_distance": (a, b, *lengths, torch.zeros(B, N), torch.full((B,), -1.0), 0.02),
+        "earth_mover_distance": (a, b, *lengths, torch.zeros(B, N), -torch.ones(B), torch.ones(B), 0.02),
         "approxmatch": (a, b, *lengths, True),
         "farthest_point_sample": (a.detach(), lengths[0], 3, 0),
         "sample_view": (a, dp.splat_depth(a, camera).visible),

@@ -104,3 +104,41 @@ def test_sets_that_span_too_much_are_refused_and_the_padding_is_not_looked_at(dt
     wide = dp.earth_mover_distance(a, b)
     exact, _ = reference.earth_mover_distance(a, b)
     torch.testing.assert_close(wide.cost, exact, rtol=2e-2, atol=0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 7), (20, 33), (33, 20), (40, 40)])
+@pytest.mark.parametrize("started", [False, True])
+def test_enough_ends_the_auction_where_it_is_proven_and_changes_nothing_elsewhere(dtype, n, m, started):
+    a, b = clouds(n, m, dtype)
+    start = dp.earth_mover_distance(a, b) if started else None
+    usual = dp.earth_mover_distance(a, b, start=start)
+    exact, _ = reference.earth_mover_distance(a, b)
+    # Below what there is; a little below; above.
+    enough = exact * torch.tensor([0.2, 0.9, 1.1], dtype=dtype)
+    result = dp.earth_mover_distance(a, b, start=start, enough=enough)
+    rounding = 1e-6 if dtype == torch.float32 else 1e-12
+    assert result.converged.all()
+    assert (result.cost[:2] >= enough[:2] - rounding).all()
+    assert (result.cost >= exact - rounding).all()
+    assert (result.cost <= exact + result.bound + rounding).all()
+    torch.testing.assert_close([v[2] for v in result], [v[2] for v in usual], rtol=0, atol=0)
+    smaller = result.assignment if n <= m else None
+    if smaller is not None:
+        assert all(row.unique().numel() == n and int(row.min()) >= 0 for row in smaller)
+
+
+def test_enough_of_clouds_far_apart_is_proven_without_a_bid():
+    a, b = clouds(50, 50)
+    far = b + 10
+    result = dp.earth_mover_distance(a, far, enough=torch.full((3,), 5.0, dtype=torch.float64))
+    assert torch.equal(result.assignment, torch.arange(50).expand(3, -1))
+    assert not result.prices.any()
+
+
+def test_enough_must_fit_the_clouds():
+    a, b = clouds(5, 5)
+    with pytest.raises(ValueError, match=r"earth_mover_distance: 'enough' must have shape \(3,\)"):
+        dp.earth_mover_distance(a, b, enough=torch.ones(2, dtype=torch.float64))
+    with pytest.raises(TypeError, match=r"earth_mover_distance: 'enough'"):
+        dp.earth_mover_distance(a, b, enough=torch.ones(3))

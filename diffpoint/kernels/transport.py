@@ -84,6 +84,7 @@ def build(real):
         object_counts: counts1,
         extent: reals1,
         start_cost: reals1,
+        enough: reals1,
         object_of: integers2,
         person_of: integers2,
         queue: integers2,
@@ -97,7 +98,8 @@ def build(real):
         """`price` and `price_lanes` are the same memory: prices to start from and, at the end, those arrived at.
 
         start_cost: about what the mean cost will be, where the prices are those of a pair like this one; negative
-        where nothing is known and all prices are 0. bound: what the mean cost can be above the best one.
+        where nothing is known and all prices are 0. enough: where the best mean cost is proven to be at least this,
+        the auction ends. bound: what the mean cost can be above the best one.
         """
         for step in range(persons.shape[0] * spread):
             if step % spread == 0:
@@ -109,9 +111,10 @@ def build(real):
                 smallest_epsilon = ti.cast(ti.cast(extent[pair], ti.f64) * resolution, real)
                 coarsest = ti.max(extent[pair] * real(COARSEST), smallest_epsilon)
                 epsilon = coarsest
-                if start_cost[pair] >= 0:
-                    # What the prices prove of this pair says how far they are from its own, and so where to begin.
-                    proven = ti.cast(0.0, ti.f64)
+                proof_wanted = ti.cast(enough[pair], ti.f64) * n
+                proven = ti.cast(-1.0, ti.f64)
+                if start_cost[pair] >= 0 or enough[pair] < far:
+                    proven = 0.0
                     for i in range(m):
                         row = ti.min(i, n - 1)
                         weight = ti.select(i < n, real(1.0), real(0.0))
@@ -127,7 +130,9 @@ def build(real):
                             weight,
                         )
                         proven += ti.cast(cheapest, ti.f64) - ti.cast(price[pair, i], ti.f64)
-                    # The cost is at least that; how far it is from the cost before, the pair has moved.
+                if start_cost[pair] >= 0:
+                    # What the prices prove of this pair says how far they are from its own, and so where to begin. The
+                    # cost is at least that; how far it is from the cost before, the pair has moved.
                     least = ti.cast(proven / n, real)
                     known = ti.max(start_cost[pair], least)
                     moved = ti.max(start_cost[pair] - least, least - start_cost[pair])
@@ -147,6 +152,19 @@ def build(real):
                     object_of[pair, i] = -1
                     person_of[pair, i] = -1
                     queue[pair, i] = i
+                if proven >= proof_wanted:
+                    # Before a single bid (prices of 0 prove the distance to the nearest object): anybody takes any.
+                    running = False
+                    cost = ti.cast(0.0, ti.f64)
+                    for i in range(m):
+                        object_of[pair, i] = i
+                        person_of[pair, i] = i
+                        if i < n:
+                            dx = persons[pair, i, 0] - objects[pair, i, 0]
+                            dy = persons[pair, i, 1] - objects[pair, i, 1]
+                            dz = persons[pair, i, 2] - objects[pair, i, 2]
+                            cost += ti.cast(ti.sqrt(dx * dx + dy * dy + dz * dz), ti.f64)
+                    bound[pair] = ti.max(cost - proven, 0.0) / n
                 while running:
                     head = 0
                     while waiting > 0 and bids < bid_limit:
@@ -221,8 +239,8 @@ def build(real):
                     best_lower_bound = ti.max(best_lower_bound, lower_bound)
                     gap = ti.max(cost - best_lower_bound, 0.0)
                     bound[pair] = gap / n
-                    enough = gap <= tolerance * cost
-                    if enough or finished[pair] == 0:
+                    good = gap <= tolerance * cost or best_lower_bound >= proof_wanted
+                    if good or finished[pair] == 0:
                         running = False
                     elif epsilon <= smallest_epsilon:
                         # As fine as the number format resolves; what remains is rounding, unless it is not small.
