@@ -14,9 +14,10 @@ from torch import Tensor
 
 import diffpoint as dp
 from train.data.categories import category_of
+from train.data.embree import load_embree
 from train.data.meshes import MeshError, load_surface
 from train.data.procedural import variants_of
-from train.data.render import draw_camera, load_embree
+from train.data.render import draw_camera
 from train.data.solids import sample_union, surface_of
 from train.data.sources import find_meshes, keep_labelled, read_labels
 from train.data.surface import Surface, sample_triangles

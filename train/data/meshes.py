@@ -15,7 +15,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 
 from train.data import store
 from train.data.categories import category_of
-from train.data.render import Renderer, draw_camera, load_embree
+from train.data.render import Renderer, draw_camera
 from train.data.sources import MeshFile, find_meshes, keep_labelled, read_labels, shape_ids
 from train.data.surface import Surface, sample_triangles
 from train.data.work import run_all
@@ -91,7 +91,6 @@ def convert(
     for name, value, low, high in (("size", size, 16, 2048), ("views", views, 1, 256)):
         if not low <= value <= high:
             raise UserError(f"{name} must be between {low} and {high}; got {value}")
-    load_embree()
     wanted = read_labels(labels) if labels is not None else None
     with tempfile.TemporaryDirectory(prefix="meshes-") as scratch:
         meshes, failures = find_meshes([Path(source) for source in sources], Path(scratch))

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from train.data import store
 from train.data.categories import SYNSET_OF
 from train.data.families import FAMILIES, MODES, Cone
-from train.data.render import MAX_RADIUS, Renderer, Views, draw_camera, load_embree, orbit_camera
+from train.data.render import MAX_RADIUS, Renderer, Views, draw_camera, orbit_camera
 from train.data.solids import Solid, sample_union, surface_of
 from train.data.work import run_all
 from train.errors import UserError
@@ -205,7 +205,6 @@ def generate(
         "variants": variants,
         "categories": list(names),
     }
-    load_embree()
     store.claim(out, settings)
     jobs = [_Job(out, names[i % len(names)], i, seed, size, views, variants) for i in range(shapes)]
     made, failures = 0, {}

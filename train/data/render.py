@@ -1,18 +1,19 @@
-"""Views of a surface by ray casting: exact depth at pixel centres, shaded colour, no OpenGL.
+"""Views of a surface: exact depth at pixel centres, shaded colour, no OpenGL.
 
-Rays leave the eye with z = 1 in the camera frame and are not normalised: embree's hit distance is the depth.
+What each pixel sees is found by embree, or by the z-buffer of `rasterise` where embree is not installed; all else is
+the same for both.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from importlib import import_module
-from typing import Any
 
 import numpy as np
 import torch
 
 from diffpoint.camera import PinholeCamera
+from train.data.embree import EmbreeCaster, has_embree
+from train.data.rasterise import Rasteriser
 from train.data.surface import Surface
 from train.errors import UserError
 
@@ -22,12 +23,13 @@ ELEVATION_DEG = (-20.0, 40.0)
 MAX_RADIUS = 0.51
 """A shape inside this radius is never cut by the frame: its half angle asin(r / 2) fits the field of view."""
 
+_FARTHEST = 9.0  # the depth files end at 10
 _AMBIENT, _DIFFUSE = 0.35, 0.6  # sum below 1: a white surface stays darker than the white background
 _DARKEST = 0.06  # a black surface still shows its shape
 _LIGHT_IN_CAM = np.array([-0.45, -0.7, -0.9]) / np.linalg.norm(
     [-0.45, -0.7, -0.9]
 )  # over the viewer's left shoulder
-_COLOUR_OFFSETS = np.array([(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)])
+_FINER = 2  # a pixel's colour is the mean of so many samples in each direction
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,49 +41,105 @@ class Views:
     camera: PinholeCamera
 
 
-def orbit_camera(azimuth_deg: np.ndarray, elevation_deg: np.ndarray, size: int) -> PinholeCamera:
-    """Cameras (V,) at distance 2 that look at the origin; azimuth 0 stands in front, at +z, and 90 at +x."""
+@dataclasses.dataclass(frozen=True)
+class Orbit:
+    """Where the cameras of a shape stand; the defaults are the paper's.
+
+    Attributes:
+        elevation_deg: lowest and highest.
+        distance: of the cameras from the middle of the shape, in world units.
+        focal: focal length over the side of the picture: 420 pixels at 224, a 60 mm lens on a 32 mm sensor.
+    """
+
+    elevation_deg: tuple[float, float] = ELEVATION_DEG
+    distance: float = DISTANCE
+    focal: float = FOCAL_PER_PIXEL
+
+    @property
+    def max_radius(self) -> float:
+        """A shape inside this radius is never cut by the frame."""
+        return self.distance * float(np.sin(np.arctan(0.5 / self.focal)))
+
+    def check(self) -> None:
+        """Refuse cameras that could not hold a shape of diagonal 1.
+
+        Raises:
+            UserError: an elevation, distance or focal length that is out of range, or a frame that is too narrow.
+        """
+        low, high = self.elevation_deg
+        if not -89 <= low <= high <= 89:
+            raise UserError(
+                f"elevation must be two angles between -89 and 89, the lower one first; got {low:g} {high:g}"
+            )
+        if not 0.6 <= self.distance <= _FARTHEST:
+            raise UserError(
+                f"distance must be between 0.6 and {_FARTHEST:g} (shapes have the diagonal 1, depth files end at 10); "
+                f"got {self.distance:g}"
+            )
+        if not 0.1 <= self.focal <= 100:
+            raise UserError(f"focal must be between 0.1 and 100 sides of the picture; got {self.focal:g}")
+        if self.max_radius < 0.5:
+            widest = (
+                self.distance * 0.5 / np.sqrt(self.distance**2 - 0.25)
+            )  # half a frame that holds the shape
+            raise UserError(
+                f"at distance {self.distance:g} and focal {self.focal:g} the frame cuts shapes of diagonal 1; "
+                f"lower focal to {np.floor(50 * self.distance / widest) / 100:g}, or stand back"
+            )
+
+
+def orbit_camera(
+    azimuth_deg: np.ndarray, elevation_deg: np.ndarray, size: int, orbit: Orbit | None = None
+) -> PinholeCamera:
+    """Cameras (V,) that look at the origin; azimuth 0 stands in front, at +z, and 90 at +x."""
+    orbit = orbit or Orbit()
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
-    eye = DISTANCE * np.stack(
+    eye = orbit.distance * np.stack(
         (np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)), axis=-1
     )
     return PinholeCamera.look_at(
-        torch.from_numpy(eye), (0.0, 0.0, 0.0), focal_px=FOCAL_PER_PIXEL * size, height=size, width=size
+        torch.from_numpy(eye), (0.0, 0.0, 0.0), focal_px=orbit.focal * size, height=size, width=size
     )
 
 
-def draw_camera(rng: np.random.Generator, views: int, size: int) -> PinholeCamera:
-    """The paper's views: equispaced on the circle from a random start, elevations uniform in [-20, 40] degrees."""
+def draw_camera(rng: np.random.Generator, views: int, size: int, orbit: Orbit | None = None) -> PinholeCamera:
+    """The paper's views: equispaced on the circle from a random start, elevations uniform between two angles."""
+    orbit = orbit or Orbit()
     azimuth_deg = rng.uniform(0, 360) + np.arange(views) * 360 / views
-    return orbit_camera(azimuth_deg, rng.uniform(*ELEVATION_DEG, views), size)
+    return orbit_camera(azimuth_deg, rng.uniform(*orbit.elevation_deg, views), size, orbit)
 
 
 class Renderer:
-    """Casts rays at one surface; building it builds embree's tree once for all views."""
+    """Renders one surface from any number of cameras.
 
-    def __init__(self, surface: Surface) -> None:
-        rtcore_scene, mesh_construction = load_embree()
+    Args:
+        surface: what is rendered.
+        caster: `EmbreeCaster` or `Rasteriser`; None for embree where it runs.
+    """
+
+    def __init__(self, surface: Surface, caster: type[EmbreeCaster] | type[Rasteriser] | None = None) -> None:
         self.surface = surface
-        self._scene = rtcore_scene.EmbreeScene()
-        mesh_construction.TriangleMesh(
-            scene=self._scene,
-            vertices=np.ascontiguousarray(surface.vertices, np.float32),
-            indices=np.ascontiguousarray(surface.faces, np.int32),
-        )
+        if caster is None:
+            caster = EmbreeCaster if has_embree() else Rasteriser
+        self._caster = caster(surface)
         low, high = surface.vertices.min(0), surface.vertices.max(0)
         self._box_corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+        first, second, third = (surface.vertices[surface.faces[:, k]] for k in range(3))
+        normals = np.cross(second - first, third - first)
+        self._normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        self._offsets = np.einsum("fc,fc->f", self._normals, first)
+        self._one_colour = bool((surface.corner_colours == surface.corner_colours[:, :1]).all())
 
     def render(self, camera: PinholeCamera) -> Views:
         """Views from cameras (V,). Depth and mask at pixel centres; colour is the mean of 2 x 2 rays."""
         images = np.full((*camera.batch_shape, camera.height, camera.width, 3), 255, np.uint8)
         depth = np.full(images.shape[:-1], np.inf, np.float32)
-        K = camera.K.double().numpy()
-        cam_from_world = camera.cam_from_world.double().numpy()
-        for view in range(len(images)):
-            rows, columns = self._window(K[view], cam_from_world[view], camera.height, camera.width)
+        for view, (K, cam_from_world) in enumerate(_matrices(camera)):
+            rows, columns = self._window(K, cam_from_world, camera.height, camera.width)
             if rows.size and columns.size:
                 box = np.s_[view, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-                images[box], depth[box] = self._render_window(K[view], cam_from_world[view], rows, columns)
+                depth[box] = self._caster.cast(K, cam_from_world, rows, columns).depth
+                images[box] = self._colours(K, cam_from_world, rows, columns)
         return Views(images, depth, camera)
 
     def _window(
@@ -95,49 +153,67 @@ class Renderer:
         low, high = np.floor(pixels.min(0)).astype(int) - 1, np.ceil(pixels.max(0)).astype(int) + 1
         return np.arange(max(low[1], 0), min(high[1], height)), np.arange(max(low[0], 0), min(high[0], width))
 
-    def _render_window(
+    def _colours(
         self, K: np.ndarray, cam_from_world: np.ndarray, rows: np.ndarray, columns: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        # One ray through each pixel's centre for the depth, then the rays of the colour: (1 + 4, rows, columns, 3).
-        offsets = np.concatenate((np.zeros((1, 2)), _COLOUR_OFFSETS)) + 0.5
-        u = offsets[:, 0, None, None, None] + columns[:, None]
-        v = offsets[:, 1, None, None, None] + rows[:, None, None]
-        rotation = cam_from_world[:3, :3]
-        per_u, per_v, constant = (rotation.T @ np.linalg.inv(K)).T
-        directions = (u * per_u + v * per_v + constant).astype(np.float32).reshape(-1, 3)
-        eye = -rotation.T @ cam_from_world[:3, 3]
-        hits = self._scene.run(
-            np.broadcast_to(eye.astype(np.float32), directions.shape).copy(), directions, output=True
-        )
-        window = (len(rows), len(columns))
-        count = len(rows) * len(columns)
-        depth = np.where(hits["primID"][:count] >= 0, hits["tfar"][:count], np.float32(np.inf))
-        colour_rays = {key: value[count:] for key, value in hits.items()}
-        colours = self._shade(colour_rays, directions[count:], _LIGHT_IN_CAM @ rotation)
-        image = colours.reshape(len(_COLOUR_OFFSETS), *window, 3).mean(0)
-        return (image * 255 + 0.5).astype(np.uint8), depth.reshape(window)
+    ) -> np.ndarray:
+        """RGB (rows, columns, 3) uint8: a finer picture, each block of it averaged."""
+        finer_K = np.diag([_FINER, _FINER, 1.0]) @ K
+        finer_rows = np.arange(_FINER * rows[0], _FINER * (rows[-1] + 1))
+        finer_columns = np.arange(_FINER * columns[0], _FINER * (columns[-1] + 1))
+        hits = self._caster.cast(finer_K, cam_from_world, finer_rows, finer_columns)
+        seen = np.flatnonzero(hits.face.ravel() >= 0)
+        face = hits.face.ravel()[seen]
+        if self._one_colour and not self.surface.textures:
+            albedo = self.surface.corner_colours[face, 0]
+        else:
+            u = finer_columns[seen % len(finer_columns)] + 0.5
+            v = finer_rows[seen // len(finer_columns)] + 0.5
+            in_cam = np.stack((u, v, np.ones(len(u))), 1) @ np.linalg.inv(finer_K).T
+            in_cam *= hits.depth.ravel()[seen, None]
+            albedo = self._albedo(face, (in_cam - cam_from_world[:3, 3]) @ cam_from_world[:3, :3])
+        albedo = _DARKEST + (1 - _DARKEST) * albedo
+        colours = np.ones((hits.face.size, 3), np.float32)
+        colours[seen] = albedo * self._light(cam_from_world)[face, None]
+        blocks = colours.reshape(len(rows), _FINER, len(columns), _FINER, 3)
+        mean = (blocks[:, 0, :, 0] + blocks[:, 0, :, 1] + blocks[:, 1, :, 0] + blocks[:, 1, :, 1]) / 4
+        return (mean * 255 + 0.5).astype(np.uint8)
 
-    def _shade(self, hits: dict, directions: np.ndarray, light: np.ndarray) -> np.ndarray:
-        """Lambert light on the side that is seen, whichever way a triangle is wound."""
+    def _light(self, cam_from_world: np.ndarray) -> np.ndarray:
+        """(F,) Lambert light on the side of each face that the camera sees, whichever way the face is wound."""
+        rotation = cam_from_world[:3, :3]
+        eye = -rotation.T @ cam_from_world[:3, 3]
+        facing = np.where(self._normals @ eye > self._offsets, 1, -1)
+        lambert = facing * (self._normals @ (_LIGHT_IN_CAM @ rotation))
+        return (_AMBIENT + _DIFFUSE * np.maximum(lambert, 0)).astype(np.float32)
+
+    def _albedo(self, face: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """(N, 3) colours of points (N, 3) on faces (N,)."""
         surface = self.surface
-        colours = np.ones((len(directions), 3), np.float32)
-        hit = np.flatnonzero(hits["primID"] >= 0)
-        face = hits["primID"][hit]
-        u, v = hits["u"][hit], hits["v"][hit]
-        weights = np.stack((1 - u - v, u, v), axis=-1)
+        weights = _barycentric(surface.vertices[surface.faces[face]], points)
         albedo = np.einsum("nk,nkc->nc", weights, surface.corner_colours[face])
         texture = surface.face_texture[face]
         for number in np.unique(texture[texture >= 0]):
-            chosen = texture == number
+            chosen = np.flatnonzero(texture == number)
             uv = np.einsum("nk,nkc->nc", weights[chosen], surface.corner_uv[face[chosen]])
             albedo[chosen] = _sample_texture(surface.textures[number], uv)
-        normals = hits["Ng"][hit]
-        facing = np.einsum("nc,nc->n", normals, directions[hit])
-        lengths = np.maximum(np.linalg.norm(normals, axis=-1), 1e-20)
-        lambert = np.where(facing < 0, 1, -1) * (normals @ light.astype(np.float32)) / lengths
-        albedo = _DARKEST + (1 - _DARKEST) * albedo
-        colours[hit] = albedo * (_AMBIENT + _DIFFUSE * np.maximum(lambert, 0))[:, None]
-        return colours
+        return albedo
+
+
+def _matrices(camera: PinholeCamera) -> list[tuple[np.ndarray, np.ndarray]]:
+    """K (3, 3) and cam_from_world (4, 4) of each camera, float64."""
+    return list(zip(camera.K.double().numpy(), camera.cam_from_world.double().numpy(), strict=True))
+
+
+def _barycentric(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Weights (N, 3) in [0, 1] float32 of points (N, 3) in the triangles (N, 3, 3) that they lie on."""
+    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    normals = np.cross(first, second)
+    offset = points - triangles[:, 0]
+    area = np.maximum(np.einsum("nc,nc->n", normals, normals), 1e-300)
+    v = np.einsum("nc,nc->n", np.cross(offset, second), normals) / area
+    w = np.einsum("nc,nc->n", np.cross(first, offset), normals) / area
+    weights = np.clip(np.stack((1 - v - w, v, w), 1), 0, 1)
+    return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
 
 
 def _sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -147,17 +223,3 @@ def _sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     column = np.minimum((uv[:, 0] * width).astype(int), width - 1)
     row = np.minimum(((1 - uv[:, 1]) * height).astype(int), height - 1)
     return texture[row, column].astype(np.float32) / 255
-
-
-def load_embree() -> tuple[Any, Any]:
-    """embree's scene and mesh modules.
-
-    Raises:
-        UserError: embreex is not installed or does not run here.
-    """
-    try:
-        return import_module("embreex.rtcore_scene"), import_module("embreex.mesh_construction")
-    except ImportError as error:
-        raise UserError(
-            f"rendering needs embreex, which fails to import ({error}); install it: pip install embreex"
-        ) from error

@@ -13,7 +13,6 @@ import numpy as np
 from train.data import store
 from train.data.families import AMBIGUOUS, FAMILIES
 from train.data.procedural import Ambiguity, ambiguity, variants_of
-from train.data.render import load_embree
 from train.data.tree import ShapeTree
 from train.data.work import run_all
 from train.errors import UserError
@@ -118,7 +117,6 @@ class _Object(NamedTuple):
 
 
 def _measure(jobs: Sequence[_Object], processes: int | None) -> RulesReport:
-    load_embree()
     figures: dict[str, dict[str, Ambiguity]] = {job.category: {} for job in jobs}
     failures = {}
     for job, result in run_all(_figure, jobs, processes=processes, desc="measuring", unit="object"):
