@@ -9,10 +9,11 @@ from diffpoint.losses import (
     diversity_loss,
     front_constraint,
     front_sets,
-    projection_loss,
 )
+from diffpoint.projection import projection_loss, soft_projection_loss
 from diffpoint.reproject import Reprojection, project, reproject, unproject
 from diffpoint.sampling import farthest_point_sample
+from diffpoint.soft_splat import SoftSplat, soft_splat
 from diffpoint.softmatch import approxmatch
 from diffpoint.splat import Splat, splat_depth
 from diffpoint.transport import Transport, earth_mover_distance
@@ -30,6 +31,7 @@ __all__ = [
     "Projection",
     "Reprojection",
     "RuntimeInfo",
+    "SoftSplat",
     "Splat",
     "Transport",
     "ViewSample",
@@ -48,6 +50,8 @@ __all__ = [
     "reproject",
     "runtime_info",
     "sample_view",
+    "soft_projection_loss",
+    "soft_splat",
     "splat_depth",
     "unproject",
     "visible_points",

@@ -1,4 +1,4 @@
-"""The paper's losses on point clouds, and the projection loss it is compared with; one renderer beneath them.
+"""The paper's losses on point clouds. The projection losses they are compared with: `projection.py`.
 
 All return a tensor: with reduction="mean" a scalar, with "none" one value per item. Distances are un-squared means in
 the unit of the clouds; the paper's sums and factors of 100 are applied where its tables are made.
@@ -17,8 +17,7 @@ from torch import Tensor
 from diffpoint import _checks
 from diffpoint.camera import PinholeCamera, check_views
 from diffpoint.distances import chamfer_distance
-from diffpoint.reproject import check_depth, unproject
-from diffpoint.splat import splat_depth
+from diffpoint.reproject import unproject
 from diffpoint.transport import earth_mover_distance
 from diffpoint.views import sample_view
 from diffpoint.visibility import Method, visible_points
@@ -64,7 +63,7 @@ def front_sets(
         >>> sets.predicted_lengths.tolist(), sets.observed_lengths.tolist()
         ([[1]], [[1]])
     """
-    batch, views = _check_maps("front_sets", points, camera, depth)
+    batch, views = check_maps("front_sets", points, camera, depth)
     sample = sample_view(points, visible_points(points, camera, method=visibility))
     seen = sample.points.expand(batch, views, -1, 3)
     lengths = sample.lengths.expand(batch, views)
@@ -114,6 +113,7 @@ def front_constraint(
     Source: CVPR 2019 paper, front constraint (section 3.2).
 
     Example:
+        >>> from diffpoint import splat_depth
         >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=8.0, height=8, width=8)
         >>> cloud = torch.rand(1, 50, 3) - 0.5
         >>> depth = splat_depth(cloud, camera).depth
@@ -155,48 +155,7 @@ def front_constraint(
         loss = loss.masked_scatter(kept, value)
     else:
         loss = loss + 0 * points.sum()  # a gradient of 0, so that a step on such a batch does not fail
-    return _reduce("front_constraint", loss, reduction)
-
-
-def projection_loss(
-    points: Tensor, camera: PinholeCamera, depth: Tensor, *, reduction: Reduction = "mean"
-) -> Tensor:
-    """mean |rendered depth - true depth| over the foreground pixels that a point fell into.
-
-    The loss the front constraint is compared with. Pixels are assigned by a step function, so its gradient moves
-    points along the camera's z axis only; empty foreground pixels and points outside the silhouette get none.
-
-    Args:
-        points: (B, N, 3) predicted clouds in the world.
-        camera: batch shape (), (V,) or (B, V), of the depth maps' size.
-        depth: (B, V, H, W) true depth maps, +inf where empty.
-        reduction: "mean" over all views, or "none" for (B, V).
-
-    Returns:
-        The loss in world units; 0 for a view in which no foreground pixel is hit.
-
-    Gradients: to the contributing points, along the camera's z axis; to the camera's extrinsics.
-
-    Raises:
-        ValueError, TypeError: wrong shapes, dtypes or devices, NaN or infinite coordinates.
-
-    Source: depth term of Lin, Kong, Lucey, "Learning efficient point cloud generation" (AAAI 2018).
-
-    Example:
-        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=8.0, height=8, width=8)
-        >>> cloud = torch.rand(1, 50, 3) - 0.5
-        >>> projection_loss(cloud, camera, splat_depth(cloud, camera).depth).item()
-        0.0
-    """
-    _check_maps("projection_loss", points, camera, depth)
-    if not torch.compiler.is_compiling():
-        check_depth("projection_loss", "depth", depth.detach())
-    rendered = splat_depth(points, camera).depth
-    both = torch.isfinite(depth) & torch.isfinite(rendered)
-    # Where not both are finite the difference is replaced before it is taken: inf - inf would poison the gradient.
-    difference = torch.where(both, rendered, 0.0) - torch.where(both, depth, 0.0)
-    loss = difference.abs().sum((-2, -1)) / both.sum((-2, -1)).clamp(min=1)
-    return _reduce("projection_loss", loss, reduction)
+    return reduce_loss("front_constraint", loss, reduction)
 
 
 def diversity_loss(
@@ -237,7 +196,7 @@ def diversity_loss(
     # Shapes that have been proven to differ enough cost nothing, however much they differ.
     enough = apart / alpha if alpha > 0 else None
     moved = earth_mover_distance(clouds[first], clouds[second], tolerance=tolerance, enough=enough).cost
-    return _reduce("diversity_loss", torch.relu(apart - alpha * moved).mean(0), reduction)
+    return reduce_loss("diversity_loss", torch.relu(apart - alpha * moved).mean(0), reduction)
 
 
 def consistency_loss(clouds: Tensor, *, reduction: Reduction = "mean") -> Tensor:
@@ -264,7 +223,7 @@ def consistency_loss(clouds: Tensor, *, reduction: Reduction = "mean") -> Tensor
     _checks.check_tensor("consistency_loss", "clouds", clouds, ("*", "V", "N", 3))
     first, second = _pairs("consistency_loss", "clouds", clouds.shape[-3])
     both = chamfer_distance(clouds[..., first, :, :], clouds[..., second, :, :], squared=False)
-    return _reduce("consistency_loss", (both.a_to_b + both.b_to_a).mean(-1), reduction)
+    return reduce_loss("consistency_loss", (both.a_to_b + both.b_to_a).mean(-1), reduction)
 
 
 def _pairs(function: str, argument: str, count: int) -> tuple[list[int], list[int]]:
@@ -275,7 +234,7 @@ def _pairs(function: str, argument: str, count: int) -> tuple[list[int], list[in
     return list(first), list(second)
 
 
-def _check_maps(function: str, points: Tensor, camera: PinholeCamera, depth: Tensor) -> tuple[int, int]:
+def check_maps(function: str, points: Tensor, camera: PinholeCamera, depth: Tensor) -> tuple[int, int]:
     """(B, V) of depth maps that fit the clouds and the cameras."""
     _checks.check_clouds(function, "points", points)
     _checks.check_tensor(function, "depth", depth, (points.shape[0], "V", camera.height, camera.width))
@@ -284,7 +243,7 @@ def _check_maps(function: str, points: Tensor, camera: PinholeCamera, depth: Ten
     return points.shape[0], depth.shape[1]
 
 
-def _reduce(function: str, loss: Tensor, reduction: Reduction) -> Tensor:
+def reduce_loss(function: str, loss: Tensor, reduction: Reduction) -> Tensor:
     _checks.check_choice(function, "reduction", reduction, ("mean", "none"))
     if reduction == "mean" and loss.numel() == 0:
         raise _checks.fail(

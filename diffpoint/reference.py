@@ -431,17 +431,6 @@ def front_constraint(
     return torch.stack(loss).view(depth.shape[:2])
 
 
-def projection_loss(points: Tensor, K: Tensor, cam_from_world: Tensor, depth: Tensor) -> Tensor:
-    """(B, V)."""
-    rendered, _, _ = splat_depth(points, K, cam_from_world, *depth.shape[-2:])
-    loss = []
-    for b, v in itertools.product(*map(range, depth.shape[:2])):
-        both = torch.isfinite(rendered[b, v]) & torch.isfinite(depth[b, v])
-        difference = rendered[b, v][both] - depth[b, v][both]
-        loss.append(difference.abs().mean() if both.any() else points.new_zeros(()))
-    return torch.stack(loss).view(depth.shape[:2])
-
-
 def diversity_loss(codes: Tensor, clouds: Tensor, *, alpha: float) -> Tensor:
     """(B,)."""
     terms = [

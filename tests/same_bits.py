@@ -134,7 +134,13 @@ OPS: dict[str, Callable[[], list[Tensor]]] = {
         *loss(lambda x, depth: dp.front_constraint(x, CAMERAS, depth, distance="emd", visibility="horizon")),
     ],
     "front_sets": lambda: [*dp.front_sets(clouds(3, 600, 4), CAMERAS, maps()[0].detach())],
-    "projection_loss": lambda: loss(lambda x, depth: dp.projection_loss(x, CAMERAS, depth)),
+    "projection_loss": lambda: loss(
+        lambda x, depth: dp.projection_loss(x, CAMERAS, depth, logits=x[..., 0], mask_weight=0.1, upsample=2)
+    ),
+    "soft_splat": lambda: [
+        t for size in ((5, 300), (1, 5000)) for t in alone(lambda x: dp.soft_splat(x, CAMERAS), *size)
+    ],
+    "soft_projection_loss": lambda: loss(lambda x, depth: dp.soft_projection_loss(x, CAMERAS, depth)),
     "diversity_loss": diversity,
     "consistency_loss": lambda: alone(lambda x: (dp.consistency_loss(x[None]),), 5, 300),
 }

@@ -17,6 +17,8 @@ CLOUDS: Ops = {
     "project": lambda x: dp.project(x, CAMERA),
     "front_constraint": lambda x: dp.front_constraint(x, CAMERA, DEPTH),
     "projection_loss": lambda x: dp.projection_loss(x, CAMERA, DEPTH),
+    "soft_splat": lambda x: dp.soft_splat(x, CAMERA),
+    "soft_projection_loss": lambda x: dp.soft_projection_loss(x, CAMERA, DEPTH),
 }
 SETS: Ops = {
     "nearest a": lambda x: dp.nearest(x, torch.rand(2, 5, 3)),
@@ -40,6 +42,7 @@ MAPS: Ops = {
     "reproject": lambda d: dp.reproject(d, CAMERA, CAMERA),
     "front_constraint": lambda d: dp.front_constraint(torch.rand(2, 9, 3), CAMERA, d),
     "projection_loss": lambda d: dp.projection_loss(torch.rand(2, 9, 3), CAMERA, d),
+    "soft_projection_loss": lambda d: dp.soft_projection_loss(torch.rand(2, 9, 3), CAMERA, d),
 }
 EVERY = CLOUDS | SETS | STACKS
 
@@ -90,7 +93,7 @@ def test_depth_maps_of_another_size(op):
         MAPS[op](torch.full((2, 2, 8, 9), 2.0))
 
 
-@pytest.mark.parametrize("op", ["unproject", "reproject", "front_constraint"])
+@pytest.mark.parametrize("op", MAPS)
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan")])
 def test_depths_that_are_none(op, bad):
     depth = DEPTH.clone()

@@ -20,10 +20,12 @@ def operator_arguments() -> dict[str, tuple]:
     camera = camera.expand(B, V)
     projection = camera.projection.clone().requires_grad_()
     depth = dp.splat_depth(a.detach(), camera).depth.requires_grad_()
+    soft = tuple(x.requires_grad_() for x in dp.project(a.detach(), camera))
     return {
         "nearest": (a, b, *lengths),
         "nearest_both": (a, b, *lengths),
         "splat": (a, lengths[0], projection, H, W, 0.0),
+        "soft_splat": (*soft, lengths[0], H, W, 2.0, 0.05),
         "project": (a, projection),
         "unproject": (depth, camera.back_projection.clone().requires_grad_()),
         "reproject": (depth, camera.back_projection.clone().requires_grad_(), projection, H, W),
@@ -108,6 +110,7 @@ def every_op(points: torch.Tensor, truth: torch.Tensor, camera: dp.PinholeCamera
     horizon = dp.visible_points(points, camera, method="horizon")
     outputs = [*splat, *sample, *dp.project(points, camera), *unprojected, chosen, horizon]
     outputs += dp.reproject(splat.depth, camera, camera[[1, 0]])
+    outputs += dp.soft_splat(points, camera, lengths=torch.full((2,), 50, device=truth.device))
     outputs += [*dp.nearest(points, truth), *dp.chamfer_distance(points, truth, squared=False)]
     outputs += dp.earth_mover_distance(points, truth)
     # The lazy device lacks a view that torch takes in the backward pass of masked_scatter: no gradient of this one.

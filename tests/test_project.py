@@ -15,7 +15,17 @@ import diffpoint
 ROOT = Path(__file__).parent.parent
 FLOORS = ("diffpoint", "models", "train")  # from the ground up
 ABOVE = ("examples", "tests", "benchmarks")
-OPS = ("losses", "splat", "views", "reproject", "distances", "transport", "softmatch", "sampling")
+OPS = (
+    "losses",
+    "splat",
+    "soft_splat",
+    "views",
+    "reproject",
+    "distances",
+    "transport",
+    "softmatch",
+    "sampling",
+)
 
 
 def imported(path: Path) -> set[str]:
@@ -51,8 +61,14 @@ def test_kernels_import_taichi_only_and_the_reference_torch_only():
             if n.split(".")[0] not in allowed and not n.startswith("diffpoint.kernels")
         }
         assert not others, f"{path.relative_to(ROOT)} imports {sorted(others)}"
-    top = {name.split(".")[0] for name in imported(ROOT / "diffpoint/reference.py")}
-    assert top <= {"torch", "itertools", "__future__"}
+    for path in files("diffpoint"):
+        if path.stem.startswith("reference"):
+            others = {
+                name
+                for name in imported(path)
+                if name.split(".")[0] not in ("torch", "itertools", "__future__")
+            }
+            assert all(name.startswith("diffpoint.reference") for name in others), f"{path.name}: {others}"
 
 
 def test_inside_the_layer_imports_point_down():

@@ -15,7 +15,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
-from properties import distances, losses, rendering
+from properties import distances, losses, projection, rendering
 from properties import strategies as throw
 from properties.judge import AGREED, REFUSED
 
@@ -71,7 +71,9 @@ def arguments(name: str, largest: int, family: str) -> tuple[st.SearchStrategy, 
         "unproject": (maps(1, family),),
         "reproject": (maps(1, family),),
         "front_constraint": (maps(small, family), st.sampled_from(["chamfer", "emd"])),
-        "projection_loss": (maps(largest, family),),
+        "projection_loss": (maps(largest, family), st.sampled_from([1, 1, 2]), st.sampled_from([0.0, 0.3])),
+        "soft_splat": (renderings(largest, family), st.sampled_from([0.01, 0.3])),
+        "soft_projection_loss": (maps(largest, family), st.sampled_from([0.0, 0.1])),
         "diversity_loss": (
             batches(small // 2, family),
             st.integers(0, 5),
@@ -84,7 +86,7 @@ def arguments(name: str, largest: int, family: str) -> tuple[st.SearchStrategy, 
 
 CHECKS = {
     name.removeprefix("check_"): check
-    for module in (distances, rendering, losses)
+    for module in (distances, rendering, losses, projection)
     for name, check in vars(module).items()
     if name.startswith("check_")
 }

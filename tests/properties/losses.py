@@ -1,8 +1,9 @@
-"""The four losses against their twins."""
+"""The paper's losses against their twins."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import torch
 
@@ -22,7 +23,7 @@ from properties.judge import (
 from properties.rendering import Maps, decided_pixels, image_bounds, twins_camera
 
 
-def _same_picture(cloud: throw.Cloud, camera: dp.PinholeCamera) -> bool:
+def same_picture(cloud: throw.Cloud, camera: dp.PinholeCamera) -> bool:
     """Do the op and its twin certainly see the same points? Then the losses on top of them can be compared."""
     matrices = twins_camera(camera, len(cloud.points))
     at = image_bounds(cloud.clean, *matrices)
@@ -34,9 +35,9 @@ def _same_picture(cloud: throw.Cloud, camera: dp.PinholeCamera) -> bool:
     )
 
 
-def _check_view_loss(case: Maps, name: str, **options) -> str:
+def view_loss(case: Maps, name: str, twin: Callable, **options) -> str:
     cloud, camera, depth, poisoned = case.make()
-    loss_of, twin = getattr(dp, name), getattr(reference, name)
+    loss_of = getattr(dp, name)
     nothing = len(depth) == 0 or case.views == 0
     no_points = name == "front_constraint" and cloud.points.shape[1] == 0
     with warnings.catch_warnings():
@@ -56,7 +57,8 @@ def _check_view_loss(case: Maps, name: str, **options) -> str:
     assert loss.shape == depth.shape[:2]
     assert torch.isfinite(loss).all()
     assert_finite_gradients(loss, cloud.points, depth)
-    if not _same_picture(cloud, camera):
+    larger = options.get("upsample", 1)
+    if not same_picture(cloud, camera.resize(camera.height * larger, camera.width * larger)):
         return BANDED
     matrices = [m.expand(*depth.shape[:2], *m.shape[-2:]) for m in twins_camera(camera, len(depth))]
     if loss.numel():
@@ -71,11 +73,7 @@ def _check_view_loss(case: Maps, name: str, **options) -> str:
 
 
 def check_front_constraint(case: Maps, distance: str) -> str:
-    return _check_view_loss(case, "front_constraint", distance=distance)
-
-
-def check_projection_loss(case: Maps) -> str:
-    return _check_view_loss(case, "projection_loss")
+    return view_loss(case, "front_constraint", reference.front_constraint, distance=distance)
 
 
 def check_diversity_loss(recipe: throw.Recipe, dimension: int, alpha: float, poison: float | None) -> str:

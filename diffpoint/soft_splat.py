@@ -1,0 +1,174 @@
+"""Soft splatting: depth maps and silhouettes that change smoothly when a point moves sideways."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffpoint import _bridge, _checks
+from diffpoint.camera import PinholeCamera
+from diffpoint.reproject import project
+
+
+class SoftSplat(NamedTuple):
+    """Soft depth maps of clouds, and how much of each pixel the points cover."""
+
+    depth: Tensor
+    """(B, V, H, W) z in the camera frame, a soft minimum over the footprints on the pixel; +inf where there is none."""
+    coverage: Tensor
+    """(B, V, H, W) sum of the footprints on the pixel; 0 where there is none."""
+
+    @property
+    def mask(self) -> Tensor:
+        """(B, V, H, W) in [0, 1): 1 - exp(-coverage)."""
+        return -torch.expm1(-self.coverage)
+
+
+def soft_splat(
+    points: Tensor,
+    camera: PinholeCamera,
+    *,
+    radius: float = 2.0,
+    softness: float = 0.02,
+    lengths: Tensor | None = None,
+) -> SoftSplat:
+    """Render clouds with soft footprints and soft depth order, so that gradients reach x and y.
+
+    A point at pixel position (u, v) covers the pixels whose centres lie within `radius` of it, with the footprint
+    k = (1 - r^2 / radius^2)^2 at distance r: 1 under the point, 0 at the edge, without a kink there. A pixel's depth
+    is the mean of the depths z on it with weights k exp(-z / softness), its coverage the sum of the k.
+
+    Args:
+        points: (B, N, 3) in the world.
+        camera: batch shape (), (V,) or (B, V), for maps of camera.height x camera.width.
+        radius: of a footprint, in pixels. Gradients to x and y reach no further than this: start large, end small. From
+            0.75 on every point covers a pixel.
+        softness: of the depth order, in world units. A point that far behind another counts exp(-1) of it; towards 0
+            the nearest point of a pixel decides, as in `splat_depth`.
+        lengths: (B,) int64, how many of the N points count; default all.
+
+    Returns:
+        `SoftSplat`. Weigh the depth with the mask: where the mask goes to 0 the depth stays that of the last point.
+
+    Gradients: of both maps to x, y and z of the points within `radius` of a pixel, and to the camera's matrices.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, a radius or softness that is not positive and finite,
+            NaN or infinite coordinates.
+
+    Source: weights exp(-z / softness) as in the soft rasterizer (Liu et al., ICCV 2019) and in Pulsar (Lassner and
+        Zollhoefer, CVPR 2021), which has a footprint that fades to its edge too; smooth point footprints for learning
+        clouds from silhouettes as in CAPNet (Navaneet et al., AAAI 2019) and in Insafutdinov and Dosovitskiy (NeurIPS
+        2018), who like us shrink them in the course of the optimisation.
+
+    Example:
+        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
+        >>> cloud = torch.tensor([[[0.1, -0.1, 0.0]]], requires_grad=True)
+        >>> soft = soft_splat(cloud, camera)
+        >>> (gradient,) = torch.autograd.grad(soft.mask[0, 0, 1, 0], cloud)
+        >>> bool(gradient[0, 0, 0] != 0)  # a step to the side covers the pixel more, or less
+        True
+    """
+    _checks.check_clouds("soft_splat", "points", points)
+    for name, value in (("radius", radius), ("softness", softness)):
+        if not 0 < value < float("inf"):
+            raise _checks.fail("soft_splat", name, "be positive and finite", repr(value))
+    lengths = _checks.check_lengths(
+        "soft_splat", "lengths", lengths, points.shape[:1], points.shape[1], points
+    )
+    whole = _bridge.full_lengths(lengths, points.shape[0], points.shape[1], points)
+    if lengths is not None:  # whatever the padding holds
+        counts = torch.arange(points.shape[1], device=points.device) < lengths[:, None]
+        points = torch.where(counts[..., None], points, 0.0)
+    if not torch.compiler.is_compiling():
+        _checks.check_finite("soft_splat", "points", points.detach())
+    pixels, depth = project(points, camera)
+    maps = _soft_splat(pixels, depth, whole, camera.height, camera.width, float(radius), float(softness))
+    return SoftSplat(maps[0], maps[1])
+
+
+def _soft_splat_fake(
+    pixels: Tensor,
+    point_depth: Tensor,
+    lengths: Tensor,
+    height: int,
+    width: int,
+    radius: float,
+    softness: float,
+):
+    return tuple(point_depth.new_empty((*point_depth.shape[:2], height, width)) for _ in range(4))
+
+
+def _soft_splat_setup(ctx, inputs, output) -> None:
+    pixels, point_depth, lengths, *ctx.sizes = inputs
+    depth, _, nearest, weight = output
+    ctx.mark_non_differentiable(nearest, weight)
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(pixels, point_depth, lengths, depth, nearest, weight)
+
+
+def _soft_splat_gradient(ctx, grad_depth: Tensor | None, grad_coverage: Tensor | None, *_):
+    pixels, point_depth, lengths, depth, nearest, weight = ctx.saved_tensors
+    grad_depth = _bridge.or_zeros(grad_depth, depth, depth.shape)
+    grad_coverage = _bridge.or_zeros(grad_coverage, depth, depth.shape)
+    saved = pixels, point_depth, lengths, depth, nearest, weight
+    gradients = _soft_splat_backward(*saved, grad_depth, grad_coverage, *ctx.sizes[2:])
+    return *gradients, *(None,) * 5
+
+
+@_bridge.register("soft_splat", fake=_soft_splat_fake, backward=_soft_splat_gradient, setup=_soft_splat_setup)
+def _soft_splat(
+    pixels: Tensor,
+    point_depth: Tensor,
+    lengths: Tensor,
+    height: int,
+    width: int,
+    radius: float,
+    softness: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Depth and coverage; then what the backward pass needs: the nearest depth, and the sum of the weights."""
+    batch, views, count = point_depth.shape
+    _checks.check_lengths_range("soft_splat", "lengths", lengths, count)
+    maps = [point_depth.new_empty(batch * views * height * width) for _ in range(4)]
+    if point_depth.numel():
+        inputs = pixels.reshape(-1), point_depth.reshape(-1), lengths
+        sizes = views, count, height, width, radius, softness
+        _bridge.launch("soft_splat", "forward", point_depth.dtype, *inputs, *maps, *sizes)
+    else:
+        for values, empty in zip(maps, (math.inf, 0.0, math.inf, 0.0), strict=True):
+            values.fill_(empty)
+    depth, coverage, nearest, weight = (m.view(batch, views, height, width) for m in maps)
+    return depth, coverage, nearest, weight
+
+
+@_bridge.register(
+    "soft_splat_backward",
+    fake=lambda pixels, point_depth, *_: (
+        pixels.new_empty(pixels.shape),
+        point_depth.new_empty(point_depth.shape),
+    ),
+)
+def _soft_splat_backward(
+    pixels: Tensor,
+    point_depth: Tensor,
+    lengths: Tensor,
+    depth: Tensor,
+    nearest: Tensor,
+    weight: Tensor,
+    grad_depth: Tensor,
+    grad_coverage: Tensor,
+    radius: float,
+    softness: float,
+) -> tuple[Tensor, Tensor]:
+    _, views, count = point_depth.shape
+    grad_pixels, grad_point_depth = pixels.new_empty(pixels.shape), point_depth.new_empty(point_depth.shape)
+    if point_depth.numel():
+        inputs = pixels.reshape(-1), point_depth.reshape(-1), lengths
+        maps = (m.reshape(-1) for m in (depth, nearest, weight, grad_depth, grad_coverage))
+        outputs = grad_pixels.view(-1), grad_point_depth.view(-1)
+        sizes = views, count, *depth.shape[2:], radius, softness
+        _bridge.launch("soft_splat", "backward", point_depth.dtype, *inputs, *maps, *outputs, *sizes)
+    return grad_pixels, grad_point_depth
