@@ -16,15 +16,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from models.autoencoder import Autoencoder, ShapeDecoder
-from models.parts import CodeBranch, LatentDecoder, PointDecoder, image_trunk, initialise
+from models.parts import CodeBranch, LatentDecoder, PointDecoder, image_trunk, initialise, prepare_images
 from models.sizes import CODE_DIM, PROFILES, Ending, GeneratorConfig
-
-# Renders stand on white and are mostly white: without centring, the constant background drowns the object,
-# and the image trunk can die while the loss still falls (the codes alone then explain the data's mean shape).
-_IMAGE_MEAN, _IMAGE_GAIN = 0.9, 3.0
 
 
 def build_generator(
@@ -127,11 +122,8 @@ class Generator(nn.Module):
 
     def encode(self, images: Tensor) -> Tensor:
         """(B, 3, H, W) images in [0, 1] -> (B, C, H/8, W/8) features, independent of the codes."""
-        size = (self.config.image_height, self.config.image_width)
-        if tuple(images.shape[-2:]) != size:
-            images = F.interpolate(images, size=size, mode="bilinear", align_corners=False, antialias=True)
-        centred = (images - _IMAGE_MEAN) * _IMAGE_GAIN
-        return self.trunk(centred.contiguous(memory_format=torch.channels_last))
+        prepared = prepare_images(images, (self.config.image_height, self.config.image_width))
+        return self.trunk(prepared.contiguous(memory_format=torch.channels_last))
 
     def decode(self, features: Tensor, codes: Tensor) -> Tensor:
         """(B, C, h, w) features and (R, B, code_dim) codes -> (R, B, N, 3) points."""

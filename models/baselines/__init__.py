@@ -1,0 +1,30 @@
+"""The methods that the paper compares itself with; two more are the conditional generator with other losses."""
+
+from __future__ import annotations
+
+from models.baselines.base import Baseline, BaselineConfig
+from models.baselines.lin import LinConfig, Structure, StructureGenerator, build_lin, fixed_cameras
+from models.baselines.psgn import build_psgn
+from models.baselines.ptn import PTNConfig, SilhouetteReconstruction, build_ptn, silhouettes
+from models.baselines.r2n2 import R2N2Config, RecurrentReconstruction, build_r2n2
+from models.baselines.voxels import cell_centres, surface_points
+
+__all__ = [
+    "Baseline",
+    "BaselineConfig",
+    "LinConfig",
+    "PTNConfig",
+    "R2N2Config",
+    "RecurrentReconstruction",
+    "SilhouetteReconstruction",
+    "Structure",
+    "StructureGenerator",
+    "build_lin",
+    "build_psgn",
+    "build_ptn",
+    "build_r2n2",
+    "cell_centres",
+    "fixed_cameras",
+    "silhouettes",
+    "surface_points",
+]

@@ -1,0 +1,184 @@
+"""Lin et al.: one image -> depth maps and masks of the shape as eight fixed cameras would see it, fused to one cloud.
+
+The cameras stand in the corners of a cube around the object and look at its centre; they are orthographic, and the map
+of each covers one unit of the world from side to side.
+
+Source: Lin, Kong, Lucey, "Learning efficient point cloud generation for dense 3D object reconstruction" (AAAI 2018).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from diffpoint import PinholeCamera
+from models.baselines.base import Baseline, BaselineConfig, choose_config, initialise_rectified
+
+_VIEWS = 8
+_BN_EPS = 1e-5
+_FIRST_GRID = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class LinConfig(BaselineConfig):
+    """Everything that fixes the network's shape.
+
+    Attributes:
+        width: factor on all hidden channels; 1 is the paper's.
+        map_size: side of the eight maps, 4 times a power of two.
+        batch_momentum: how much a batch counts in the running statistics; less in longer trainings.
+    """
+
+    width: float = 0.25
+    map_size: int = 32
+    batch_momentum: float = 0.02
+
+
+LIN_PROFILES = {
+    "full": LinConfig("full", 64, 64, 2048, 1.0, 128, 0.001),
+    "cpu": LinConfig(),
+    "smoke": LinConfig("smoke", 32, 32, 128, 0.125, 16, 0.1),
+}
+
+
+def build_lin(profile: str = "cpu", *, config: LinConfig | None = None) -> StructureGenerator:
+    """Builds the structure generator with freshly drawn weights.
+
+    Args:
+        profile: "full" (64 x 64 images, eight maps of 128 x 128, 24.18 million parameters, of which 0.52 million are
+            the last layer's biases, one for every pixel), "cpu" (maps of 32 x 32) or "smoke" (16 x 16).
+        config: sizes of your own; `profile` is then ignored.
+
+    Example:
+        >>> model = build_lin("smoke")
+        >>> model(torch.rand(2, 3, 56, 56), torch.zeros(1, 2, 0)).shape
+        torch.Size([1, 2, 512, 3])
+    """
+    return StructureGenerator(choose_config("build_lin", LIN_PROFILES, profile, config))
+
+
+class Structure(NamedTuple):
+    """What the eight fixed cameras see.
+
+    Attributes:
+        pixels: (B, 8, 2, S, S) where each pixel's point is, x and y in pixels of the map.
+        depth: (B, 8, S, S) the point's depth; every camera stands one unit from the origin.
+        logits: (B, 8, S, S) above 0 where there is something to see.
+    """
+
+    pixels: Tensor
+    depth: Tensor
+    logits: Tensor
+
+
+class StructureGenerator(Baseline):
+    """Image -> structure -> cloud."""
+
+    config: LinConfig
+    world_from_cams: Tensor
+
+    def __init__(self, config: LinConfig) -> None:
+        super().__init__()
+        self.config = config
+        upsamplings = round(math.log2(config.map_size / _FIRST_GRID))
+        if _FIRST_GRID * 2**upsamplings != config.map_size or not 1 <= upsamplings <= 5:
+            raise ValueError(f"LinConfig: map_size must be 8, 16, 32, 64 or 128; got {config.map_size}")
+
+        def widen(*channels: int) -> list[int]:
+            return [max(4, round(c * config.width)) for c in channels]
+
+        def rectified(layer: nn.Module, norm: nn.Module) -> list[nn.Module]:
+            return [layer, norm, nn.ReLU()]
+
+        def dense(inputs: int, outputs: int) -> list[nn.Module]:
+            norm = nn.BatchNorm1d(outputs, _BN_EPS, config.batch_momentum, affine=False)
+            return rectified(nn.Linear(inputs, outputs, bias=False), norm)
+
+        def conv(inputs: int, outputs: int, stride: int) -> list[nn.Module]:
+            norm = nn.BatchNorm2d(outputs, _BN_EPS, config.batch_momentum, affine=False)
+            return rectified(nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), norm)
+
+        convs = widen(96, 128, 192, 256)
+        seen = convs[-1] * math.ceil(config.image_height / 16) * math.ceil(config.image_width / 16)
+        wide, middle, code, first = widen(2048, 1024, 512, 256)
+        layers: list[nn.Module] = []
+        for inputs, outputs in itertools.pairwise((3, *convs)):
+            layers += conv(inputs, outputs, stride=2)
+        layers += [nn.Flatten(), *dense(seen, wide), *dense(wide, middle), nn.Linear(middle, code)]
+        self.encoder = nn.Sequential(*layers)
+
+        grid = first * _FIRST_GRID**2
+        layers = [nn.ReLU(), *dense(code, middle), *dense(middle, wide), *dense(wide, grid)]
+        layers += [nn.Unflatten(1, (first, _FIRST_GRID, _FIRST_GRID))]
+        for inputs, outputs in itertools.pairwise((first, *widen(192, 128, 96, 64, 48)[:upsamplings])):
+            layers += [nn.Upsample(scale_factor=2), *conv(inputs, outputs, stride=1)]
+            first = outputs
+        self.decoder = nn.Sequential(*layers)
+        self.maps = nn.Conv2d(first, 4 * _VIEWS, 1, bias=False)
+        self.map_bias = nn.Parameter(_flat_maps(config.map_size))
+        initialise_rectified(self)
+        nn.init.normal_(self.maps.weight, std=0.01)
+        self.register_buffer("world_from_cams", _fixed_poses().inverse(), persistent=False)
+
+    def structure(self, images: Tensor) -> Structure:
+        """(B, 3, H, W) in [0, 1] -> what the eight cameras see; with gradient, by the network's mode."""
+        maps = self.maps(self.decoder(self.encoder(self._prepare(images))))
+        size = self.config.map_size
+        x, y, depth, logits = (maps.unflatten(1, (4, _VIEWS)) + self.map_bias).unbind(1)
+        assert x.shape[1:] == (_VIEWS, size, size)
+        return Structure(torch.stack([x, y], 2), depth, logits)
+
+    def fuse(self, structure: Structure) -> Tensor:
+        """The points of all eight maps, of empty pixels too: (B, 8*S*S, 3) in the world frame, camera by camera."""
+        across = structure.pixels / self.config.map_size - 0.5
+        in_cams = torch.cat([across, structure.depth[:, :, None]], 2).flatten(3)
+        turned = self.world_from_cams[:, :3, :3] @ in_cams + self.world_from_cams[:, :3, 3:]
+        return turned.transpose(2, 3).flatten(1, 2)
+
+    def _answers(self, images: Tensor) -> Tensor:
+        structure = self.structure(images.flatten(0, 1))
+        clouds, kept = self.fuse(structure), structure.logits.flatten(1) > 0
+        count = kept.shape[1] // 4  # about as many pixels as an object covers
+        answers = [_spread_over(cloud[_some(mask)], count) for cloud, mask in zip(clouds, kept, strict=True)]
+        return torch.stack(answers).unflatten(0, images.shape[:2])
+
+
+def fixed_cameras(points: Tensor) -> Tensor:
+    """Clouds in the frames of the eight cameras: (B, N, 3) -> (B, 8, N, 3), x right, y down, z the depth.
+
+    Example:
+        >>> fixed_cameras(torch.zeros(1, 1, 3))[0, :, 0, 2].tolist()
+        [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+    """
+    poses = _fixed_poses().to(points)
+    return points[:, None] @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
+
+
+def _fixed_poses() -> Tensor:
+    """(8, 4, 4) camera from world: a cube's corners, one unit from the origin."""
+    corners = torch.tensor(list(itertools.product((-1.0, 1.0), repeat=3))) / math.sqrt(3)
+    poses = [PinholeCamera.look_at(eye, focal_px=1.0, height=1, width=1).cam_from_world for eye in corners]
+    return torch.stack(poses).reshape(_VIEWS, 4, 4)
+
+
+def _flat_maps(size: int) -> Tensor:
+    """(4, 8, S, S): every pixel at its centre and at the origin's depth, undecided whether it is empty."""
+    centres = torch.arange(size) + 0.5
+    x, y = centres.expand(size, size), centres[:, None].expand(size, size)
+    maps = torch.stack([x, y, torch.ones(size, size), torch.zeros(size, size)])
+    return maps[:, None].repeat(1, _VIEWS, 1, 1)
+
+
+def _some(mask: Tensor) -> Tensor:
+    """The mask, or all if it is empty: a cloud has to have points."""
+    return mask if bool(mask.any()) else torch.ones_like(mask)
+
+
+def _spread_over(cloud: Tensor, count: int) -> Tensor:
+    """(n, 3) -> (count, 3): evenly spread over the list, some left out or some repeated."""
+    return cloud[torch.arange(count) * len(cloud) // count]

@@ -1,0 +1,140 @@
+"""PTN: one image -> an occupancy grid, taught by the silhouettes that cameras see of it.
+
+The perspective transformer samples the grid along the rays of a camera; a pixel's silhouette is the largest occupancy
+on its ray. The published network first learns its encoder by rotating objects; here it is trained jointly from the
+start.
+
+Source: Yan, Yang, Yumer, Guo, Lee, "Perspective transformer nets: Learning single-view 3D object reconstruction without
+3D supervision" (NeurIPS 2016).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from diffpoint import PinholeCamera
+from models.baselines.base import Baseline, BaselineConfig, choose_config, initialise_rectified
+from models.baselines.voxels import surface_points
+
+_THRESHOLD = 0.5
+_RAY_SAMPLES = 32
+# The cube [-0.5, 0.5]^3 seen from any side lies within this distance of the origin's depth.
+_HALF_DIAGONAL = math.sqrt(3) / 2
+
+
+@dataclasses.dataclass(frozen=True)
+class PTNConfig(BaselineConfig):
+    """Everything that fixes the network's shape; the grid has 32^3 cells.
+
+    Attributes:
+        encoder: channels of the convolutions that halve the image.
+        features: length of an image's vector, after two layers of `hidden`.
+        hidden: see `features`.
+        decoder: channels of the first 3^3 cells and of the two grids between them and the last.
+    """
+
+    encoder: tuple[int, int, int] = (16, 32, 64)
+    hidden: int = 256
+    features: int = 128
+    decoder: tuple[int, int, int] = (64, 32, 16)
+
+
+PTN_PROFILES = {
+    "full": PTNConfig("full", 64, 64, 2048, (64, 128, 256), 1024, 512, (512, 256, 96)),
+    "cpu": PTNConfig(),
+    "smoke": PTNConfig("smoke", 32, 32, 128, (8, 8, 16), 64, 32, (16, 8, 4)),
+}
+
+
+def build_ptn(profile: str = "cpu", *, config: PTNConfig | None = None) -> SilhouetteReconstruction:
+    """Builds the network with freshly drawn weights.
+
+    Args:
+        profile: "full" (64 x 64 images, 37.96 million parameters), "cpu" or "smoke".
+        config: sizes of your own; `profile` is then ignored.
+
+    Example:
+        >>> model = build_ptn("smoke")
+        >>> model.occupancy(torch.rand(2, 3, 56, 56)).shape
+        torch.Size([2, 32, 32, 32])
+    """
+    return SilhouetteReconstruction(choose_config("build_ptn", PTN_PROFILES, profile, config))
+
+
+class SilhouetteReconstruction(Baseline):
+    """One image -> occupancies in [0, 1]."""
+
+    config: PTNConfig
+
+    def __init__(self, config: PTNConfig) -> None:
+        super().__init__()
+        self.config = config
+        a, b, c = config.encoder
+        first, second, third = config.decoder
+        seen = c * math.ceil(config.image_height / 8) * math.ceil(config.image_width / 8)
+        self.encoder = nn.Sequential(
+            *(nn.Conv2d(3, a, 5, 2, 2), nn.ReLU(), nn.Conv2d(a, b, 5, 2, 2), nn.ReLU()),
+            *(nn.Conv2d(b, c, 5, 2, 2), nn.ReLU(), nn.Flatten()),
+            *(nn.Linear(seen, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.hidden), nn.ReLU()),
+            *(nn.Linear(config.hidden, config.features), nn.ReLU()),
+        )
+        self.decoder = nn.Sequential(
+            *(nn.Linear(config.features, 27 * first), nn.ReLU(), nn.Unflatten(1, (first, 3, 3, 3))),
+            *(nn.ConvTranspose3d(first, second, 4), nn.ReLU()),
+            *(nn.ConvTranspose3d(second, third, 5, 2), nn.ReLU()),
+            nn.ConvTranspose3d(third, 1, 6, 2, 1),
+        )
+        initialise_rectified(self)
+
+    def occupancy(self, images: Tensor) -> Tensor:
+        """(B, 3, H, W) in [0, 1] -> (B, 32, 32, 32) in [0, 1], with gradient."""
+        return self.decoder(self.encoder(self._prepare(images)))[:, 0].sigmoid()
+
+    def _answers(self, images: Tensor) -> Tensor:
+        occupancy = self.occupancy(images.flatten(0, 1))
+        points = surface_points(occupancy, self.points, threshold=_THRESHOLD)
+        return points.unflatten(0, images.shape[:2])
+
+
+def silhouettes(occupancy: Tensor, camera: PinholeCamera, *, samples: int = _RAY_SAMPLES) -> Tensor:
+    """The perspective transformer: how solid the grid looks in each pixel.
+
+    Every ray is sampled at equal steps of depth, where it can meet the cube [-0.5, 0.5]^3; outside the grid is empty.
+
+    Args:
+        occupancy: (B, G, G, G) in [0, 1], along x, y and z of the world.
+        camera: (B, V), with the size of the maps.
+        samples: per ray.
+
+    Returns:
+        (B, V, H, W) in [0, 1], the largest occupancy on the ray, interpolated between cells.
+
+    Gradients: to the cells around each ray's largest sample.
+
+    Example:
+        >>> grid = torch.zeros(1, 8, 8, 8)
+        >>> grid[:, 2:6, 2:6, 2:6] = 1.0
+        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=8.0, height=8, width=8).expand(1, 1)
+        >>> (silhouettes(grid, camera)[0, 0, 3:5] > 0.5).int().tolist()
+        [[0, 0, 0, 1, 1, 0, 0, 0], [0, 0, 0, 1, 1, 0, 0, 0]]
+    """
+    batch, views = camera.batch_shape
+    height, width = camera.height, camera.width
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels = torch.stack([columns, rows, torch.ones_like(rows)], -1).reshape(-1, 3).to(occupancy)
+    world_from_cam = camera.cam_from_world.inverse()
+    rays = (
+        pixels @ (world_from_cam[..., :3, :3] @ camera.K.inverse()).mT
+    )  # (B, V, H*W, 3), one unit of depth long
+    middle = camera.cam_from_world[..., 2, 3]
+    depth = middle[..., None] + torch.linspace(-_HALF_DIAGONAL, _HALF_DIAGONAL, samples).to(occupancy)
+    places = camera.position[..., None, None, :] + depth[..., None, None] * rays[:, :, None]
+    # The last of a place's coordinates comes first in grid_sample, and the grid's border is at 1.
+    grid = 2 * places.flip(-1).reshape(batch, views * samples, height * width, 1, 3)
+    found = F.grid_sample(occupancy[:, None], grid, align_corners=False)
+    return found.reshape(batch, views, samples, height, width).amax(2)

@@ -1,0 +1,225 @@
+"""The other methods' networks: sizes as published, shapes, where voxels' points lie, what silhouettes see."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from diffpoint import PinholeCamera, splat_depth
+from models import Generator
+from models.baselines import (
+    Baseline,
+    build_lin,
+    build_psgn,
+    build_ptn,
+    build_r2n2,
+    cell_centres,
+    fixed_cameras,
+    silhouettes,
+    surface_points,
+)
+
+_BUILDERS: list[Callable[..., Baseline]] = [build_lin, build_r2n2, build_ptn]
+
+
+def _chain(kernel: int, *channels: int, biases: bool = True) -> int:
+    """Parameters of a chain of layers, each seeing `kernel` places."""
+    pairs = itertools.pairwise(channels)
+    return sum(inputs * outputs * kernel + biases * outputs for inputs, outputs in pairs)
+
+
+def _lin() -> int:
+    encoder = _chain(9, 3, 96, 128, 192, 256, biases=False) + _chain(1, 4096, 2048, 1024, biases=False)
+    code = _chain(1, 1024, 512) + _chain(1, 512, 1024, 2048, 4096, biases=False)
+    decoder = _chain(9, 256, 192, 128, 96, 64, 48, biases=False) + 48 * 32
+    return encoder + code + decoder + 4 * 8 * 128 * 128
+
+
+def _r2n2() -> int:
+    first = _chain(49, 3, 96) + _chain(9, 96, 96)
+    blocks = _chain(9, 96, 128, 128) + _chain(9, 128, 256, 256) + 3 * _chain(9, 256, 256, 256)
+    skips = _chain(1, 96, 128) + _chain(1, 128, 256)
+    encoder = first + blocks + skips + _chain(1, 3 * 3 * 256, 1024)
+    memory = 3 * (1024 * 128 * 64 + _chain(27, 128, 128))
+    decoder = 2 * _chain(27, 128, 128, 128) + _chain(27, 128, 64, 64) + _chain(1, 128, 64)
+    return encoder + memory + decoder + _chain(27, 64, 32, 32) + _chain(27, 64, 32) + _chain(27, 32, 2)
+
+
+def _ptn() -> int:
+    encoder = _chain(25, 3, 64, 128, 256) + _chain(1, 8 * 8 * 256, 1024, 1024, 512)
+    decoder = _chain(1, 512, 512 * 27) + _chain(64, 512, 256) + _chain(125, 256, 96) + _chain(216, 96, 1)
+    return encoder + decoder
+
+
+@pytest.mark.parametrize(
+    ("build", "millions", "by_hand"),
+    [
+        (build_psgn, 39.70, None),
+        (build_lin, 24.18, _lin),
+        (build_r2n2, 35.93, _r2n2),
+        (build_ptn, 37.96, _ptn),
+    ],
+)
+def test_full_sizes_have_the_published_layers(
+    build: Callable[[str], torch.nn.Module], millions: float, by_hand: Callable[[], int] | None
+) -> None:
+    count = sum(p.numel() for p in build("full").parameters())
+    assert count == pytest.approx(1e6 * millions, abs=5_001)
+    assert by_hand is None or count == by_hand()
+    assert f"{millions:.2f} million" in (build.__doc__ or "")
+
+
+@pytest.mark.parametrize("profile", ["cpu", "smoke"])
+@pytest.mark.parametrize("build", _BUILDERS)
+def test_they_are_called_like_a_generator(build: Callable[[str], Baseline], profile: str) -> None:
+    torch.manual_seed(0)
+    network = build(profile).train()
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    images = torch.rand(2, 3, 50, 70)
+    clouds = network(images, torch.zeros(3, 2, network.code_dim))
+    assert clouds.shape[:2] == (3, 2)
+    assert clouds.shape[2] >= network.points
+    assert clouds.isfinite().all()
+    assert not clouds.requires_grad
+    assert torch.equal(clouds[0], network.answers(images[:, None])[:, 0])
+    assert network.training
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize("build", _BUILDERS)
+def test_several_views_of_an_object(build: Callable[[str], Baseline]) -> None:
+    torch.manual_seed(0)
+    network, images = build("smoke"), torch.rand(2, 3, 3, 32, 32)
+    answers = network.answers(images)
+    assert answers.shape[:2] == ((2, 1) if network.reads_views_together else (2, 3))
+    if not network.reads_views_together:
+        torch.testing.assert_close(answers[:, 1], network.answers(images[:, 1:2])[:, 0], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("build", _BUILDERS)
+def test_wrong_arguments_are_named(build: Callable[[str], Baseline]) -> None:
+    with pytest.raises(ValueError, match=f"{build.__name__}: 'profile'"):
+        build("huge")
+    network = build("smoke")
+    with pytest.raises(ValueError, match="'images'"):
+        network.answers(torch.rand(2, 3, 32, 32))
+    with pytest.raises(ValueError, match="'codes'"):
+        network(torch.rand(2, 3, 32, 32), torch.zeros(1, 3, 0))
+
+
+def test_psgn_is_the_generator_without_codes() -> None:
+    network = build_psgn("smoke")
+    assert isinstance(network, Generator)
+    assert network.code_branch is None
+
+
+def _gradients_by_network() -> list[tuple[Callable[[str], Baseline], Callable[[Any, Tensor], Tensor]]]:
+    return [
+        (build_lin, lambda net, images: torch.cat([x.flatten() for x in net.structure(images[:, 0])]).norm()),
+        (build_r2n2, lambda net, images: net.logits(images).square().sum()),
+        (build_ptn, lambda net, images: net.occupancy(images[:, 0]).square().sum()),
+    ]
+
+
+@pytest.mark.parametrize(("build", "measure"), _gradients_by_network())
+def test_gradient_reaches_every_parameter(
+    build: Callable[[str], Baseline], measure: Callable[[Any, Tensor], Tensor]
+) -> None:
+    torch.manual_seed(0)
+    network = build("smoke")
+    measure(network, torch.rand(4, 2, 3, 32, 32)).backward()
+    silent = [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    assert silent == []
+
+
+def test_fixed_cameras_and_fused_maps_are_inverse() -> None:
+    """A point drawn at its place and depth in every map comes back eight times."""
+    torch.manual_seed(0)
+    network = build_lin("smoke")
+    points = torch.rand(2, 16**2, 3) - 0.5
+    seen = fixed_cameras(points)
+    structure = network.structure(torch.rand(2, 3, 32, 32))
+    pixels = ((seen[..., :2] + 0.5) * 16).mT.unflatten(-1, (16, 16))
+    fused = network.fuse(structure._replace(pixels=pixels, depth=seen[..., 2].unflatten(-1, (16, 16))))
+    torch.testing.assert_close(fused.unflatten(1, (8, 256)), points[:, None].expand(2, 8, 256, 3))
+
+
+def test_a_fresh_structure_is_eight_flat_maps() -> None:
+    torch.manual_seed(0)
+    structure = build_lin("smoke").structure(torch.rand(4, 3, 32, 32))
+    centres = torch.arange(16) + 0.5
+    assert (structure.pixels[:, :, 0] - centres).abs().max() < 0.5
+    assert (structure.pixels[:, :, 1] - centres[:, None]).abs().max() < 0.5
+    assert (structure.depth - 1).abs().max() < 0.5
+
+
+def test_memory_reads_views_in_order_and_all_of_them() -> None:
+    torch.manual_seed(0)
+    network, images = build_r2n2("smoke"), torch.rand(1, 3, 3, 32, 32)
+    logits = network.logits(images)
+    for view in range(3):
+        other = images.clone()
+        other[:, view] = 0.0
+        assert (network.logits(other) - logits).abs().max() > 1e-5
+
+
+def _ball(size: int, radius: float) -> Tensor:
+    return (cell_centres(size).norm(dim=1) < radius).float().reshape(1, size, size, size)
+
+
+def test_surface_points_lie_on_the_faces_between_occupied_and_empty() -> None:
+    grid = _ball(16, 0.35)
+    points = surface_points(grid, 2000, threshold=0.5)[0]
+    on_a_face = ((points + 0.5) * 16 - ((points + 0.5) * 16).round()).abs().amin(1) < 1e-4
+    assert on_a_face.all()
+    assert (points.norm(dim=1) - 0.35).abs().max() < 3**0.5 / 16
+    assert points.mean(0).abs().max() < 0.01
+    # A face has two sides: a step to either, along its normal, finds an occupied and an empty cell.
+    for axis in range(3):
+        here = (points[:, axis] * 16 - (points[:, axis] * 16).round()).abs() < 1e-4
+        both = []
+        for step in (-0.03, 0.03):
+            cell = points[here].clone()
+            cell[:, axis] += step
+            x, y, z = ((cell + 0.5) * 16).long().clamp(0, 15).unbind(1)
+            both.append(grid[0, x, y, z] > 0.5)
+        assert (both[0] != both[1]).float().mean() > 0.99
+
+
+def test_every_face_gets_its_share_of_points() -> None:
+    grid = torch.zeros(1, 8, 8, 8)
+    grid[0, 3, 3, 3] = 1.0
+    points = surface_points(grid, 600, threshold=0.5)[0] - (torch.tensor(3.5) / 8 - 0.5)
+    for axis in range(3):
+        for side in (-1, 1):
+            face = points[(points[:, axis] * side - 1 / 16).abs() < 1e-5]
+            assert len(face) == pytest.approx(100, abs=2)
+            assert face.std(0).sort().values[1:].tolist() == pytest.approx([0.036, 0.036], abs=0.004)
+
+
+def test_a_grid_without_occupied_cells_still_has_a_surface() -> None:
+    grid = torch.rand(1, 8, 8, 8) * 0.1
+    points = surface_points(grid, 50, threshold=0.5)
+    assert points.shape == (1, 50, 3)
+    assert points.isfinite().all()
+    likeliest = grid.flatten().topk(8).indices
+    assert torch.cdist(points[0], cell_centres(8)[likeliest]).amin(1).max() < 0.9 / 8
+
+
+def test_silhouettes_are_those_of_the_splatted_cells() -> None:
+    """Beside the dense points of a solid: an L, to see that no axis is turned or mirrored."""
+    grid = torch.zeros(1, 32, 32, 32)
+    grid[0, 8:24, 8:12, 10:20] = 1.0
+    grid[0, 8:12, 8:28, 10:20] = 1.0
+    solid = cell_centres(32)[grid.flatten() > 0]
+    cloud = (solid[:, None] + (torch.rand(1, 60, 3) - 0.5) / 32).reshape(1, -1, 3)
+    eyes = [(2.0, 0.5, 0.3), (-0.5, 0.4, -2.0), (0.3, 1.9, 0.2)]
+    camera = PinholeCamera.look_at(torch.tensor([eyes]), focal_px=170.0, height=96, width=96)
+    seen = silhouettes(grid, camera, samples=64) > 0.5
+    drawn = splat_depth(cloud, camera).depth.isfinite()
+    assert (seen & drawn).sum() / (seen | drawn).sum() > 0.9
