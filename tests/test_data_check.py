@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -9,7 +10,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
+from diffpoint.io import read_depth, read_points, write_depth, write_points
+from train.__main__ import main
 from train.data import ShapeTree, store
 from train.data.check import agreement, check_tree
 from train.data.meshes import convert
@@ -123,6 +127,114 @@ def test_problems_are_named(procedural, tmp_path):
         assert [p for p in report.problems if p.startswith(shape) and what in p], (what, report.problems)
     assert len(report.problems) == 5
     assert "5 problems" in report.summary()
+
+
+def edit_camera(path, **changes):
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def halve(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def resize(path, size):
+    Image.open(path).resize((size, size)).save(path)
+
+
+def blank(path):
+    write_depth(path, torch.full((112, 112), torch.inf))
+
+
+def filled(path):
+    write_depth(path, torch.full((112, 112), 2.0))
+
+
+# What is done to the second view's files (or to all views of a shape), and what the line about it says.
+DAMAGES = {
+    "a missing view": (lambda f: (f / "render_1.png").unlink(), r"render_1\.png is missing"),
+    "no last view": (
+        lambda f: [(f / f"{kind}_3.{end}").unlink() for kind, end in FILES],
+        r"3 views, elsewhere 4$",
+    ),
+    "a picture cut short": (lambda f: halve(f / "render_1.png"), r"render_1\.png cannot be read"),
+    "a depth map cut short": (lambda f: halve(f / "depth_1.png"), r"depth_1\.png cannot be read"),
+    "a picture of another size": (
+        lambda f: resize(f / "render_1.png", 100),
+        r"pictures of view 1 are \(100, 100\)",
+    ),
+    "an empty mask": (lambda f: blank(f / "depth_1.png"), r"view 1 shows nothing"),
+    "no background": (lambda f: filled(f / "depth_1.png"), r"view 1 has no background"),
+    "no focal length": (
+        lambda f: edit_camera(f / "camera_1.json", K=[[0, 0, 56], [0, 0, 56], [0, 0, 1]]),
+        r"camera_1\.json cannot be read .*K cannot be inverted",
+    ),
+    "a pose that is none": (
+        lambda f: edit_camera(f / "camera_1.json", cam_from_world=np.diag([1, 0, 1, 1]).tolist()),
+        r"cam_from_world cannot be inverted",
+    ),
+    "a mirrored pose": (
+        lambda f: edit_camera(f / "camera_1.json", cam_from_world=np.diag([1, -1, 1, 1]).tolist()),
+        r"is no rotation",
+    ),
+    "other depth": (
+        lambda f: write_depth(f / "depth_1.png", read_depth(f / "depth_1.png") + 1),
+        "do not agree",
+    ),
+}
+FILES = (("render", "png"), ("depth", "png"), ("camera", "json"))
+
+
+def test_each_kind_of_damage_is_one_line_and_the_other_shapes_stand(procedural, tmp_path, capsys):
+    root = tmp_path / "data"
+    shutil.copytree(procedural, root)
+    trees = [ShapeTree(root, split) for split in store.SPLITS]
+    victim = max(trees, key=len).ids[1]
+    folder, copy = store.render_folder(root, victim), tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    whole = sum(map(len, trees))
+    for name, (damage, said) in DAMAGES.items():
+        damage(folder)
+        report = check_tree(root, processes=1)
+        about = [problem for problem in report.problems if problem.startswith(victim)]
+        assert [problem for problem in about if re.search(said, problem)], (name, report.problems)
+        assert len(report.problems) == len(about) <= 2, (name, report.problems)
+        assert sum(each.holds for each in report.agreements if each.id != victim) == whole - 1
+        shutil.rmtree(folder)
+        shutil.copytree(copy, folder)
+    assert check_tree(root, processes=1).problems == []
+    halve(folder / "render_0.png")
+    assert main(["data", "check", str(root)]) == 1
+    out = capsys.readouterr().out
+    assert "1 problem:" in out
+    assert f"{victim}: {folder / 'render_0.png'} cannot be read" in out
+
+
+def test_pictures_of_another_object_and_shapes_unlike_the_rest_are_named(procedural, tmp_path):
+    root = tmp_path / "data"
+    shutil.copytree(procedural, root)
+    ids = [shape for split in store.SPLITS for shape in ShapeTree(root, split).ids]
+    chair = next(shape for shape in ids if shape.startswith("03001627"))
+    display = next(shape for shape in ids if shape.startswith("03211117"))
+    chair_image = store.render_folder(root, chair) / "render_2.png"
+    shutil.copy(chair_image, store.render_folder(root, display) / "render_2.png")
+    few = ids[-1]
+    write_points(store.cloud_file(root, few), read_points(store.cloud_file(root, few))[::2])
+    problems = check_tree(root, processes=1).problems
+    assert [p for p in problems if p.startswith(f"{display}: view 2: ") and "outside the mask" in p], problems
+    assert [p for p in problems if p == f"{few}: 1024 points, elsewhere 2048"], problems
+    assert len(problems) == 2
+
+
+def test_a_tree_of_ours_whose_clouds_were_turned_is_not_turned_back_in_silence(procedural, tmp_path):
+    root = tmp_path / "data"
+    shutil.copytree(procedural, root)
+    for cloud in (root / store.CLOUDS).glob("*/*.ply"):
+        x, y, z = read_points(cloud).T
+        write_points(cloud, torch.stack((x, -z, y), 1))
+    report = check_tree(root, processes=1)
+    said = "clouds are z-up, cameras expect y-up; not as this program wrote them: make the data again"
+    assert report.frame.verdict == said
+    assert f"{root}: {said}" in report.problems
 
 
 def test_no_data(tmp_path):

@@ -1,60 +1,37 @@
-"""Reading the dataset on disk: `Shape` and `ShapeTree`."""
+"""Reading the dataset on disk: `ShapeTree`."""
 
 from __future__ import annotations
 
-import dataclasses
-import json
+import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Protocol
 
-import imageio.v3 as imageio
-import numpy as np
-import scipy.io
-import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from diffpoint.camera import PinholeCamera
-from diffpoint.io import read_depth, read_points
+from diffpoint.io import read_points
 from train.data import store
 from train.data.categories import CATEGORY_OF, SYNSET_OF, category_of, synset_of
+from train.data.choy import Choy, find_renderings
+from train.data.frames import AS_IT_IS, SAMPLE, Frame, find_frame, is_own
+from train.data.release import Release
+from train.data.shape import Shape, ShapeError, ViewsRead, read_file
 from train.errors import UserError
-from train.images import on_white
 
-
-class ShapeError(UserError):
-    """A shape that cannot be read; the message names the shape, the file and the reason."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Shape:
-    """One object: its views, their cameras and its surface.
-
-    Attributes:
-        images: (V, 3, H, W) float32 in [0, 1], on white.
-        depth: (V, H, W) float32, z in the camera frame; +inf where nothing is seen.
-        camera: PinholeCamera (V,), float32.
-        points: (N, 3) float32, world frame, y up.
-        id: "synset/model".
-        category: for instance "chair".
-    """
-
-    images: Tensor
-    depth: Tensor
-    camera: PinholeCamera
-    points: Tensor
-    id: str
-    category: str
+__all__ = ["Shape", "ShapeError", "ShapeTree", "frame_of", "layout_of", "read_shape"]
 
 
 class ShapeTree:
     """The shapes of one split; `tree[i]` reads shape i from disk.
 
+    Trees of this program, of the paper's release, and of Choy's renderings with clouds beside them are read alike;
+    where clouds and cameras of a tree from elsewhere are in different frames, they are turned when read (`frame_of`).
+
     A broken shape raises `ShapeError` from `tree[i]`; `iter_valid` and `load_all` leave it out, and `skipped`
     names it with the reason. Shapes without files are found at once and are not counted in `len(tree)`.
 
     Args:
-        path: a folder made by `python -m train data`, or the paper's release.
+        path: a folder made by `python -m train data`, the paper's release, or Choy's renderings.
         split: "train", "val" or "test".
         categories: names or synsets to keep; all by default.
 
@@ -70,12 +47,12 @@ class ShapeTree:
         self.skipped: dict[str, str] = {}
         if split not in store.SPLITS:
             raise UserError(f"ShapeTree: split must be one of {', '.join(store.SPLITS)}; got {split!r}")
-        synsets = self._synsets(categories)
+        layout = layout_of(self.path)
+        members = layout.listed(split)
         self.ids: list[str] = []
-        for synset in synsets:
-            lines = (self.path / store.LISTS / split / f"{synset}.list").read_text().split("\n")
-            for shape in filter(None, map(str.strip, lines)):
-                reason = self._missing(shape)
+        for synset in self._chosen(list(members), categories):
+            for shape in members[synset]:
+                reason = _missing(layout, shape)
                 if reason:
                     self.skipped[shape] = reason
                 else:
@@ -117,18 +94,7 @@ class ShapeTree:
             raise UserError(f"{self.path} has no readable shape in the {self.split} split ({first})")
         return shapes
 
-    def _synsets(self, categories: Sequence[str] | None) -> list[str]:
-        lists = self.path / store.LISTS
-        if not (self.path / store.RENDERS).is_dir():
-            raise UserError(
-                f"no data at {self.path}; make some with: "
-                f"python -m train data procedural --out {self.path} --shapes 400"
-            )
-        if not lists.is_dir():
-            raise UserError(
-                f"the data at {self.path} are not finished; run the command that makes them again"
-            )
-        present = sorted(path.stem for path in (lists / self.split).glob("*.list"))
+    def _chosen(self, present: list[str], categories: Sequence[str] | None) -> list[str]:
         if categories is None:
             return present
         wanted = [name if name in CATEGORY_OF else synset_of(name) for name in categories]
@@ -139,74 +105,109 @@ class ShapeTree:
                 raise UserError(f"{self.path} has no category {name!r}{spelling}; it has: {known}")
         return wanted
 
-    def _missing(self, shape: str) -> str | None:
-        if not store.render_folder(self.path, shape).is_dir():
-            return f"{shape}: no folder {store.render_folder(self.path, shape)}"
-        if not store.cloud_file(self.path, shape).is_file():
-            return f"{shape}: no file {store.cloud_file(self.path, shape)}"
-        return None
+
+class Layout(Protocol):
+    """A way to lay out a tree on disk; shapes are named "synset/model"."""
+
+    root: Path
+
+    def listed(self, split: str) -> dict[str, list[str]]:
+        """Synset -> the shapes of a split, whether they are there or not."""
+        ...
+
+    def folder(self, shape: str) -> Path:
+        """Where the views are."""
+        ...
+
+    def cloud_file(self, shape: str) -> Path:
+        """Where the ground truth is."""
+        ...
+
+    def on_disk(self) -> list[str]:
+        """The shapes that have a folder, listed or not."""
+        ...
+
+    def read_views(self, shape: str) -> ViewsRead:
+        """Pictures, depth and cameras, as the files have them; a `ShapeError` names what is broken."""
+        ...
+
+
+def layout_of(root: Path) -> Layout:
+    """How the tree at `root` is laid out.
+
+    Raises:
+        UserError: there is no tree, or it lacks what it needs.
+    """
+    if (root / store.RENDERS).is_dir():
+        return Release(root)
+    renderings = find_renderings(root)
+    if renderings is None:
+        raise UserError(
+            f"no data at {root}; make some with: python -m train data procedural --out {root} --shapes 400"
+        )
+    return Choy(root, renderings)
 
 
 def read_shape(root: Path, shape: str) -> Shape:
-    """Read the shape "synset/model".
+    """Read the shape "synset/model", in the world with y up.
 
     Raises:
         ShapeError: a file is missing or broken, or the files do not fit together.
     """
-    folder = store.render_folder(root, shape)
-    count = len(list(folder.glob("render_*.png")))
-    if count == 0:
-        raise ShapeError(f"{shape}: no render_*.png in {folder}")
-    images = [_read(shape, folder / f"render_{i}.png", _read_image) for i in range(count)]
-    depth = [_read(shape, folder / f"depth_{i}.png", read_depth) for i in range(count)]
-    size = images[0].shape[1:]
-    for i in range(count):
-        if images[i].shape[1:] != size or depth[i].shape != size:
-            raise ShapeError(
-                f"{shape}: {folder}: the pictures of view {i} are {tuple(images[i].shape[1:])} and "
-                f"{tuple(depth[i].shape)} pixels, view 0 is {tuple(size)}"
-            )
-    cameras = [_read(shape, _camera_file(folder, i), _read_camera) for i in range(count)]
+    return frame_of(root).applied(_read_as_it_is(layout_of(root), shape))
+
+
+def frame_of(root: Path) -> Frame:
+    """What has to be turned in this tree when it is read; `data check` prints it.
+
+    Found out once per process from a few shapes that are spread over the tree, without writing anything. Trees that
+    this program made are right and not looked at.
+    """
+    if is_own(root):
+        return AS_IT_IS
+    return _found_frame(root.resolve(), root.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=16)
+def _found_frame(root: Path, _: int) -> Frame:
+    return find_frame(sample_shapes(layout_of(root)))
+
+
+def sample_shapes(layout: Layout, among: Sequence[str] | None = None) -> list[Shape]:
+    """Up to `SAMPLE` shapes that can be read, spread over the tree or over those named, as their files have them."""
+    if among is None:
+        among = [
+            shape for split in store.SPLITS for members in layout.listed(split).values() for shape in members
+        ]
+    order = [among[(number * len(among)) // (4 * SAMPLE)] for number in range(4 * SAMPLE)] if among else []
+    found: list[Shape] = []
+    for shape in dict.fromkeys(order[start + step] for step in range(4) for start in range(0, len(order), 4)):
+        try:
+            found.append(_read_as_it_is(layout, shape))
+        except ShapeError:
+            continue
+        if len(found) == SAMPLE:
+            break
+    return found
+
+
+def _read_as_it_is(layout: Layout, shape: str) -> Shape:
+    folder, cloud = layout.folder(shape), layout.cloud_file(shape)
+    if not folder.is_dir():
+        raise ShapeError(f"{shape}: no folder {folder}")
+    views = layout.read_views(shape)
     return Shape(
-        images=torch.stack(images),
-        depth=torch.stack(depth),
-        camera=PinholeCamera(
-            torch.stack([K for K, _ in cameras]), torch.stack([pose for _, pose in cameras]), size[0], size[1]
-        ),
-        points=_read(shape, store.cloud_file(root, shape), read_points),
+        images=views.images,
+        depth=views.depth,
+        camera=views.camera,
+        points=read_file(shape, cloud, read_points),
         id=shape,
         category=category_of(shape.split("/")[0]),
     )
 
 
-def _read(shape: str, path: Path, reader):
-    try:
-        return reader(path)
-    except FileNotFoundError as error:
-        raise ShapeError(f"{shape}: {path} is missing") from error
-    except Exception as error:  # every decoder has its own way to say that a file is broken
-        raise ShapeError(f"{shape}: {path} cannot be read ({type(error).__name__}: {error})") from error
-
-
-def _read_image(path: Path) -> Tensor:
-    """(3, H, W) in [0, 1]; transparency shows white."""
-    return on_white(np.atleast_3d(imageio.imread(path)))
-
-
-def _camera_file(folder: Path, view: int) -> Path:
-    matlab = folder / f"camera_{view}.mat"
-    return matlab if matlab.is_file() else folder / f"camera_{view}.json"
-
-
-def _read_camera(path: Path) -> tuple[Tensor, Tensor]:
-    """K (3, 3) and cam_from_world (4, 4), from our JSON or from the release's .mat (K, extrinsic)."""
-    if path.suffix == ".mat":
-        record = scipy.io.loadmat(path)
-        extrinsic = np.asarray(record["extrinsic"], np.float32)
-        pose = np.concatenate((extrinsic[:3], np.array([[0, 0, 0, 1]], np.float32)))
-    else:
-        record = json.loads(path.read_text())
-        pose = np.array(record["cam_from_world"], np.float32)
-    K = np.array(record["K"], np.float32)
-    PinholeCamera(torch.from_numpy(K), torch.from_numpy(pose), 1, 1)  # refuses what is no camera
-    return torch.from_numpy(K), torch.from_numpy(pose)
+def _missing(layout: Layout, shape: str) -> str | None:
+    folder, cloud = layout.folder(shape), layout.cloud_file(shape)
+    if not folder.is_dir():
+        return f"{shape}: no folder {folder}"
+    return None if cloud.is_file() else f"{shape}: no file {cloud}"

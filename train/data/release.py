@@ -1,0 +1,137 @@
+"""The tree of the paper's release, which is also the one that this program writes; see `train.data.store`.
+
+The release differs in details: cameras are MATLAB files (K, extrinsic), renders have an alpha channel, there is no list
+for validation, and clouds may keep the folder name under which they are distributed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import scipy.io
+import torch
+from torch import Tensor
+
+from diffpoint.camera import PinholeCamera
+from diffpoint.io import read_depth
+from train.data import store
+from train.data.shape import ShapeError, ViewsRead, make_camera, read_file, read_pixels
+from train.errors import UserError
+from train.images import on_white
+
+CLOUD_FOLDERS = (store.CLOUDS, "shape_net_core_uniform_samples_2048")
+"""Names of the folder with the clouds; the second is that of the archive in which ShapeNet's are distributed."""
+_VALIDATION_SHARE = 0.1
+_NUMBERED = re.compile(r"(?:render|depth|camera)_(\d+)\.(?:png|json|mat)")
+
+
+def listed(root: Path, split: str) -> dict[str, list[str]]:
+    """Synset -> "synset/model" of every line of the split's lists.
+
+    A tree with lists for training and testing only keeps a tenth of the training shapes for validation, chosen by
+    their names.
+    """
+    lists = root / store.LISTS
+    if (lists / split).is_dir() or (split == "train" and not (lists / "test").is_dir()):
+        shapes = _read_lists(lists / split)
+        lacks_validation = split == "train" and not (lists / "val").is_dir()
+        return _part(shapes, validation=False) if lacks_validation else shapes
+    return _part(_read_lists(lists / "train"), validation=True) if split == "val" else {}
+
+
+def _read_lists(folder: Path) -> dict[str, list[str]]:
+    found = {}
+    for path in sorted(folder.glob("*.list")):
+        lines = filter(None, map(str.strip, path.read_text().split("\n")))
+        found[path.stem] = [line if "/" in line else f"{path.stem}/{line}" for line in lines]
+    return found
+
+
+def _part(shapes: dict[str, list[str]], *, validation: bool) -> dict[str, list[str]]:
+    return {
+        synset: [shape for shape in members if (_fraction(shape) < _VALIDATION_SHARE) == validation]
+        for synset, members in shapes.items()
+    }
+
+
+def _fraction(shape: str) -> float:
+    return int.from_bytes(hashlib.sha256(f"validation {shape}".encode()).digest()[:8], "big") / 2**64
+
+
+class Release:
+    """A tree with `rendered-shapenet`, clouds and lists."""
+
+    def __init__(self, root: Path) -> None:
+        if not (root / store.LISTS).is_dir():
+            raise UserError(f"the data at {root} are not finished; run the command that makes them again")
+        self.root = root
+        clouds = [root / name for name in CLOUD_FOLDERS if (root / name).is_dir()]
+        self._clouds = clouds[0] if clouds else root / store.CLOUDS
+
+    def listed(self, split: str) -> dict[str, list[str]]:
+        """Synset -> the shapes that the split's lists name."""
+        return listed(self.root, split)
+
+    def folder(self, shape: str) -> Path:
+        """Where the views are."""
+        return store.render_folder(self.root, shape)
+
+    def cloud_file(self, shape: str) -> Path:
+        """Where the ground truth is."""
+        return self._clouds / f"{shape}.ply"
+
+    def on_disk(self) -> list[str]:
+        """Every shape that has a folder, in a list or not."""
+        folders = sorted((self.root / store.RENDERS).glob("*/[!.]*"))
+        return [f"{folder.parent.name}/{folder.name}" for folder in folders]
+
+    def read_views(self, shape: str) -> ViewsRead:
+        """All views of a shape.
+
+        Raises:
+            ShapeError: a file is missing or broken, or the pictures have different sizes.
+        """
+        folder = self.folder(shape)
+        numbers = {int(match[1]) for path in folder.iterdir() if (match := _NUMBERED.fullmatch(path.name))}
+        if not numbers:
+            raise ShapeError(f"{shape}: no render_*.png in {folder}")
+        count = max(numbers) + 1
+        images = [read_file(shape, folder / f"render_{i}.png", _read_image) for i in range(count)]
+        depth = [read_file(shape, folder / f"depth_{i}.png", read_depth) for i in range(count)]
+        size = images[0].shape[1:]
+        for i in range(count):
+            if images[i].shape[1:] != size or depth[i].shape != size:
+                raise ShapeError(
+                    f"{shape}: {folder}: the pictures of view {i} are {tuple(images[i].shape[1:])} and "
+                    f"{tuple(depth[i].shape)} pixels, view 0 is {tuple(size)}"
+                )
+        cameras = [read_file(shape, _camera_file(folder, i), _read_camera) for i in range(count)]
+        K, cam_from_world = (torch.stack(matrices) for matrices in zip(*cameras, strict=True))
+        return ViewsRead(
+            torch.stack(images), torch.stack(depth), PinholeCamera(K, cam_from_world, size[0], size[1])
+        )
+
+
+def _read_image(path: Path) -> Tensor:
+    """(3, H, W) in [0, 1]; transparency shows white."""
+    return on_white(read_pixels(path))
+
+
+def _camera_file(folder: Path, view: int) -> Path:
+    matlab = folder / f"camera_{view}.mat"
+    return matlab if matlab.is_file() else folder / f"camera_{view}.json"
+
+
+def _read_camera(path: Path) -> tuple[Tensor, Tensor]:
+    """K (3, 3) and cam_from_world (4, 4), from our JSON or from the release's .mat (K, extrinsic)."""
+    if path.suffix == ".mat":
+        record = scipy.io.loadmat(path)
+        pose = np.eye(4)
+        pose[:3] = np.asarray(record["extrinsic"], float)[:3]
+        return make_camera(record["K"], pose)
+    record = json.loads(path.read_text())
+    return make_camera(record["K"], record["cam_from_world"])
