@@ -108,7 +108,8 @@ def test_materials_and_textures_of_an_archive_reach_the_picture(tmp_path):
     (folder / "wall.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl wood\nKd 1 1 1\nmap_Kd green wood.png\n")
     (folder / "wall.obj").write_text(
         "mtllib wall.mtl\nv -1 0 0\nv 0 0 0\nv 0 1 0\nv -1 1 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
-        "usemtl red\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\nusemtl wood\nf 2/1 5/2 6/3\nf 2/1 6/3 3/4\n"
+        "v 0 0 -0.1\nusemtl red\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\nf 1/1 2/2 7/3\n"
+        "usemtl wood\nf 2/1 5/2 6/3\nf 2/1 6/3 3/4\n"
     )
     with zipfile.ZipFile(tmp_path / "library.sh3f", "w") as archive:
         for path in folder.iterdir():
@@ -178,7 +179,7 @@ def test_labels_that_fit_nothing_or_are_none(tmp_path):
     headless.write_text("a,b\n1,2\n")
     for labels, message in (
         (foreign, "speaks of other, the sources are lib"),
-        (headless, "no column library, model, category"),
+        (headless, "no column model, category"),
         (tmp_path / "missing.csv", "cannot be read"),
     ):
         with pytest.raises(UserError, match=message):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, subcommand
 
@@ -50,18 +50,43 @@ class Meshes:
     """Directory of the new data tree."""
     labels: Path | None = None
     """CSV that names the category of each mesh; only labelled meshes are taken then."""
+    category: str | None = None
+    """What all of the meshes are; by default a folder on the path says so, by name or by synset."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "y"
+    """The axis that points up in the files; a .sh3f library says so itself."""
+    scale: float | None = None
+    """World units per unit of the files, where sizes matter; by default each mesh gets a box with the diagonal 1."""
+    drop_hidden: bool = False
+    """Leave points out of the ground truth that neither a view nor anybody outside can see."""
     size: int = 224
     """Side of the renders in pixels; 112 is enough for the cpu profile."""
     views: int = 8
-    """Views per mesh."""
+    """Views per mesh, evenly around it."""
+    elevation: tuple[float, float] = (-20.0, 40.0)
+    """Lowest and highest elevation of the cameras in degrees."""
+    distance: float = 2.0
+    """Of the cameras from the middle of the mesh."""
+    focal: float = 1.875
+    """Focal length over the side of the renders; 1.875 is 420 pixels at 224."""
     seed: int = 0
     """Seeds cameras, surface samples and the split."""
+    processes: int | None = None
+    """How many work at once; one per core by default."""
 
     def run(self) -> None:
-        from train.data.meshes import convert
+        from train.data.meshes import MeshOptions, convert
+        from train.data.render import Orbit
 
+        orbit = Orbit(self.elevation, self.distance, self.focal)
         report = convert(
-            self.sources, self.out, labels=self.labels, size=self.size, views=self.views, seed=self.seed
+            self.sources,
+            self.out,
+            labels=self.labels,
+            size=self.size,
+            views=self.views,
+            seed=self.seed,
+            processes=self.processes,
+            options=MeshOptions(self.category, self.up, self.scale, self.drop_hidden, orbit),
         )
         print(report.summary())
 

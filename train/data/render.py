@@ -14,7 +14,7 @@ import torch
 from diffpoint.camera import PinholeCamera
 from train.data.embree import EmbreeCaster, has_embree
 from train.data.rasterise import Rasteriser
-from train.data.surface import Surface
+from train.data.surface import Hits, Surface
 from train.errors import UserError
 
 DISTANCE = 2.0
@@ -115,6 +115,11 @@ class Renderer:
     Args:
         surface: what is rendered.
         caster: `EmbreeCaster` or `Rasteriser`; None for embree where it runs.
+
+    Attributes:
+        surface: the same.
+        normals: (F, 3) of the faces' planes.
+        offsets: (F,) normal . x = offset on a face.
     """
 
     def __init__(self, surface: Surface, caster: type[EmbreeCaster] | type[Rasteriser] | None = None) -> None:
@@ -126,8 +131,8 @@ class Renderer:
         self._box_corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
         first, second, third = (surface.vertices[surface.faces[:, k]] for k in range(3))
         normals = np.cross(second - first, third - first)
-        self._normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-        self._offsets = np.einsum("fc,fc->f", self._normals, first)
+        self.normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        self.offsets = np.einsum("fc,fc->f", self.normals, first)
         self._one_colour = bool((surface.corner_colours == surface.corner_colours[:, :1]).all())
 
     def render(self, camera: PinholeCamera) -> Views:
@@ -141,6 +146,19 @@ class Renderer:
                 depth[box] = self._caster.cast(K, cam_from_world, rows, columns).depth
                 images[box] = self._colours(K, cam_from_world, rows, columns)
         return Views(images, depth, camera)
+
+    def hits(self, camera: PinholeCamera, view: int) -> Hits:
+        """The face and depth that one of the cameras (V,) sees at each pixel's centre, (height, width)."""
+        K, cam_from_world = _matrices(camera)[view]
+        rows, columns = self._window(K, cam_from_world, camera.height, camera.width)
+        hits = Hits(
+            np.full((camera.height, camera.width), -1),
+            np.full((camera.height, camera.width), np.inf, np.float32),
+        )
+        if rows.size and columns.size:
+            box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+            hits.face[box], hits.depth[box] = self._caster.cast(K, cam_from_world, rows, columns)
+        return hits
 
     def _window(
         self, K: np.ndarray, cam_from_world: np.ndarray, height: int, width: int
@@ -182,8 +200,8 @@ class Renderer:
         """(F,) Lambert light on the side of each face that the camera sees, whichever way the face is wound."""
         rotation = cam_from_world[:3, :3]
         eye = -rotation.T @ cam_from_world[:3, 3]
-        facing = np.where(self._normals @ eye > self._offsets, 1, -1)
-        lambert = facing * (self._normals @ (_LIGHT_IN_CAM @ rotation))
+        facing = np.where(self.normals @ eye > self.offsets, 1, -1)
+        lambert = facing * (self.normals @ (_LIGHT_IN_CAM @ rotation))
         return (_AMBIENT + _DIFFUSE * np.maximum(lambert, 0)).astype(np.float32)
 
     def _albedo(self, face: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -7,28 +7,34 @@ import dataclasses
 import hashlib
 import math
 import re
-import shutil
 import unicodedata
-import zipfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from train.data.categories import CATEGORY_OF, SYNSET_OF, UNKNOWN, synset_of
+from train.data.archives import ARCHIVE_SUFFIXES, Rotation, catalogue_rotations, is_library, unpack
+from train.data.categories import SYNSET_OF, UNKNOWN, synset_of
 from train.data.store import CLOUDS
 from train.errors import UserError
 
 MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".off", ".stl")
-ARCHIVE_SUFFIXES = (".zip", ".sh3f")
 _NO_NAMES = {"model", "models", "model_normalized", "mesh", "meshes", "object"}
 _NOT_A_MODEL = re.compile(rf"(^|/)(\.|__MACOSX/|{CLOUDS}/)")
 """Hidden files, the shadow files of macOS archives, and the clouds of a dataset made below the source."""
 
-_CATALOGUE = "PluginFurnitureCatalog.properties"
+_SYNSET = re.compile(r"[01]\d{7}")  # WordNet's offsets; a folder that is a date starts with 2
 
-Rotation = tuple[float, ...]
+UPRIGHT: dict[str, Rotation | None] = {
+    "y": None,
+    "z": (1, 0, 0, 0, 0, 1, 0, -1, 0),
+    "x": (0, -1, 0, 1, 0, 0, 0, 0, 1),
+    "-y": (-1, 0, 0, 0, -1, 0, 0, 0, 1),
+    "-z": (1, 0, 0, 0, 0, -1, 0, 1, 0),
+    "-x": (0, 1, 0, -1, 0, 0, 0, 0, 1),
+}
+"""What stands a model upright, by the axis that points up in its file. With z up, its front is taken to be at -y."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,8 +72,15 @@ class Label:
     """What stands the model upright and facing +z where its library's own rotation does not."""
 
 
-def find_meshes(sources: Sequence[Path], scratch: Path) -> tuple[list[MeshFile], dict[str, str]]:
+def find_meshes(
+    sources: Sequence[Path], scratch: Path, *, up: str = "y"
+) -> tuple[list[MeshFile], dict[str, str]]:
     """All meshes of the sources; archives are unpacked below `scratch`.
+
+    Args:
+        sources: folders, archives and mesh files.
+        scratch: a folder for what is unpacked; it must outlive the meshes.
+        up: the axis that points up in the files, a key of `UPRIGHT`. A Sweet Home 3D library says so itself.
 
     Returns:
         The meshes, and by name the archive members that were refused.
@@ -81,13 +94,19 @@ def find_meshes(sources: Sequence[Path], scratch: Path) -> tuple[list[MeshFile],
         if not source.exists():
             raise UserError(f"no such file or folder: {source}")
         if source.is_dir():
-            meshes += _in_folder(source, source.resolve().name)
+            meshes += _in_folder(source, source.resolve().name, UPRIGHT[up])
             archives = sorted(path for path in source.rglob("*") if path.suffix.lower() in ARCHIVE_SUFFIXES)
         elif source.suffix.lower() in ARCHIVE_SUFFIXES:
             archives = [source]
         elif source.suffix.lower() in MESH_SUFFIXES:
             meshes.append(
-                MeshFile(source, source.resolve().parent.name, source.name, _synset_from(source.parts))
+                MeshFile(
+                    source,
+                    source.resolve().parent.name,
+                    source.name,
+                    _synset_from(source.resolve().parts[-4:-1]),
+                    UPRIGHT[up],
+                )
             )
             archives = []
         else:
@@ -95,73 +114,39 @@ def find_meshes(sources: Sequence[Path], scratch: Path) -> tuple[list[MeshFile],
             raise UserError(f"{source} is no folder and none of {known}")
         for archive in archives:
             folder = scratch / str(len(list(scratch.iterdir())))
-            refused |= _unpack(archive, folder)
-            meshes += _in_folder(folder, archive.name, _catalogue_rotations(folder))
+            refused |= unpack(archive, folder)
+            upright = None if is_library(folder) else UPRIGHT[up]
+            meshes += _in_folder(folder, archive.name, upright, catalogue_rotations(folder))
     return meshes, refused
 
 
-def _in_folder(folder: Path, library: str, rotations: dict[str, Rotation] | None = None) -> list[MeshFile]:
+def _in_folder(
+    folder: Path, library: str, upright: Rotation | None, rotations: dict[str, Rotation] | None = None
+) -> list[MeshFile]:
     found = []
     for path in sorted(folder.rglob("*")):
         inside = path.relative_to(folder).as_posix()
         if path.suffix.lower() in MESH_SUFFIXES and path.is_file() and not _NOT_A_MODEL.search(inside):
             synset = _synset_from((library, *PurePosixPath(inside).parts[:-1]))
-            found.append(MeshFile(path, library, inside, synset, (rotations or {}).get(inside)))
+            found.append(MeshFile(path, library, inside, synset, (rotations or {}).get(inside, upright)))
     return found
 
 
 def _synset_from(parts: Iterable[str]) -> str:
     """The category that a folder on the way is named after (by name, plural or synset), the innermost first."""
     for part in reversed(tuple(parts)):
+        if _SYNSET.fullmatch(part):
+            return part
         for name in (part.lower(), part.lower().removesuffix("s")):
-            if name in CATEGORY_OF:
-                return name
             if name in SYNSET_OF:
                 return SYNSET_OF[name]
     return UNKNOWN
 
 
-def _unpack(archive: Path, folder: Path) -> dict[str, str]:
-    """Unpack an archive; a member that would land outside the folder is refused and named."""
-    refused = {}
-    folder.mkdir(parents=True)
-    try:
-        with zipfile.ZipFile(archive) as content:
-            members = [member for member in content.infolist() if not member.is_dir()]
-            if sum(member.file_size for member in members) > shutil.disk_usage(folder).free:
-                raise UserError(f"{archive} unpacks to more than the free space of {folder.parent}")
-            for member in members:
-                parts = PurePosixPath(member.filename.replace("\\", "/")).parts
-                name = f"{archive.name}: {member.filename}"
-                if ".." in parts or member.filename.startswith(("/", "\\")) or ":" in parts[0]:
-                    refused[name] = "its path leads out of the archive"
-                    continue
-                try:
-                    content.extract(member, folder)
-                except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, EOFError) as error:
-                    refused[name] = f"cannot be unpacked ({error})"
-    except zipfile.BadZipFile as error:
-        raise UserError(f"{archive} is no zip archive ({error}); fetch it again") from error
-    return refused
-
-
-def _catalogue_rotations(folder: Path) -> dict[str, Rotation]:
-    """How a Sweet Home 3D library turns its models, by path; its other models stand upright and face +z already."""
-    catalogue = folder / _CATALOGUE
-    if not catalogue.is_file():
-        return {}
-    entries = dict(re.findall(r"^(\w+#\d+)=(.*?)\s*$", catalogue.read_text("latin-1"), re.MULTILINE))
-    rotations = {}
-    for key, model in entries.items():
-        if key.startswith("model#"):
-            numbers = entries.get(key.replace("model#", "modelRotation#"), "").split()
-            if len(numbers) == 9:
-                rotations[model.lstrip("/")] = tuple(float(number) for number in numbers)
-    return rotations
-
-
 def read_labels(path: Path) -> list[Label]:
-    """Read a label file with the columns library, model and category, and where wanted synset and turn.
+    """Read a label file with the columns model and category, and where wanted library, synset and turn.
+
+    A model is a path inside its library, which is a source folder or archive by name; without one, inside any.
 
     A turn is an axis and the degrees by which a model is turned about it, after its library's own rotation: with `x90`
     a telephone that lies on its back stands up and faces +z.
@@ -174,14 +159,12 @@ def read_labels(path: Path) -> list[Label]:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"the label file {path} cannot be read ({error})") from error
-    missing = [
-        column for column in ("library", "model", "category") if not rows or rows[0].get(column) is None
-    ]
+    missing = [column for column in ("model", "category") if not rows or rows[0].get(column) is None]
     if missing:
         raise UserError(f"the label file {path} has no column {', '.join(missing)}, or no lines")
     return [
         Label(
-            row["library"],
+            row.get("library") or "",
             row["model"],
             row.get("synset") or synset_of(row["category"].strip()),
             _turn_of(row.get("turn") or "", f"{path}: {row['model']}"),
@@ -221,16 +204,19 @@ def keep_labelled(
     Raises:
         UserError: no label fits any mesh.
     """
-    by_place = {(mesh.library, mesh.inside): mesh for mesh in meshes}
+    by_place: dict[tuple[str, str], list[MeshFile]] = defaultdict(list)
+    for mesh in meshes:
+        by_place[mesh.library, mesh.inside].append(mesh)
+        by_place["", mesh.inside].append(mesh)
     kept, absent = [], {}
     libraries = {mesh.library for mesh in meshes}
     for label in labels:
-        mesh = by_place.get((label.library, label.model))
-        if mesh is not None:
+        found = by_place.get((label.library, label.model), [])
+        for mesh in found:
             turned = _followed_by(mesh.rotation, label.turn)
             kept.append(dataclasses.replace(mesh, synset=label.synset, rotation=turned))
-        elif label.library in libraries:
-            absent[f"{label.library}: {label.model}"] = (
+        if not found and label.library in libraries | {""}:
+            absent[f"{label.library or path.name}: {label.model}"] = (
                 "the label file names it, its library does not have it"
             )
     if not kept:
@@ -241,8 +227,15 @@ def keep_labelled(
     return kept, absent
 
 
+def of_category(meshes: Sequence[MeshFile], category: str) -> list[MeshFile]:
+    """The meshes, all of one category: a name of the paper's, a synset, or a name of one's own."""
+    synset = _synset_from([category])
+    synset = synset_of(category) if synset == UNKNOWN else synset
+    return [dataclasses.replace(mesh, synset=synset) for mesh in meshes]
+
+
 def _some(names: set[str]) -> str:
-    return ", ".join(sorted(names)[:5]) or "nothing"
+    return ", ".join(sorted(name or "any library" for name in names)[:5]) or "nothing"
 
 
 def shape_ids(meshes: Sequence[MeshFile]) -> list[str]:

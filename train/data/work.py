@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.context import SpawnContext
@@ -12,26 +15,48 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
+from train.errors import UserError
+
+UNWRITABLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS})
+"""Errors of the disk and not of the file: no other file can be written either."""
+
 Job = TypeVar("Job")
 _JOBS_WORTH_A_PROCESS = 8
 
 
 def run_all(
-    function: Callable[[Job], Any], jobs: Sequence[Job], *, processes: int | None, desc: str, unit: str
-) -> Iterator[tuple[Job, Any]]:
+    function: Callable[[Job], Any],
+    jobs: Sequence[Job],
+    *,
+    processes: int | None,
+    desc: str,
+    unit: str,
+    progress: bool = True,
+) -> Generator[tuple[Job, Any], None, None]:
     """Yield (job, result) as jobs end. `function` must return its failures; a crash yields an `OSError`.
 
     Args:
         function: a module-level function of one picklable job.
         processes: at most this many; None means one per core, and only this one for a handful of jobs.
+        desc: of the bar.
+        unit: of the bar.
+        progress: show the bar.
+
+    Raises:
+        UserError: a job's result says that the disk is full.
     """
     wanted = processes or min(os.cpu_count() or 1, -(-len(jobs) // _JOBS_WORTH_A_PROCESS))
-    with tqdm(total=len(jobs), desc=desc, unit=unit) as bar:
+    with tqdm(total=len(jobs), desc=desc, unit=unit, disable=not progress) as bar:
         if wanted <= 1:
             results = ((job, function(job)) for job in jobs)
         else:
             results = _in_pool(function, jobs, wanted)
         for job, result in results:
+            if isinstance(result, OSError) and result.errno in UNWRITABLE:
+                raise UserError(
+                    f"{desc} stopped: {result.strerror}. What is finished stays; make room, then run the same "
+                    "command again"
+                )
             bar.update()
             yield job, result
 
@@ -44,7 +69,7 @@ def _in_pool(
     context = multiprocessing.get_context("spawn")
     left = dict.fromkeys(range(len(jobs)))
     while left:
-        pool = ProcessPoolExecutor(min(processes, len(left)), mp_context=context)
+        pool = ProcessPoolExecutor(min(processes, len(left)), mp_context=context, initializer=_follow_parent)
         futures = {pool.submit(function, jobs[number]): number for number in left}
         try:
             for future in as_completed(futures):
@@ -60,8 +85,21 @@ def _in_pool(
 
 
 def _alone(function: Callable[[Job], Any], job: Job, context: SpawnContext) -> Any:
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
+    with ProcessPoolExecutor(1, mp_context=context, initializer=_follow_parent) as pool:
         try:
             return pool.submit(function, job).result()
         except BrokenProcessPool:
             return OSError("the process that worked on it crashed or ran out of memory")
+
+
+def _follow_parent() -> None:
+    """Leave Ctrl-C to the parent, and end with it: the children of a killed process would wait for work for ever."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
