@@ -13,14 +13,14 @@ from models.sizes import CODE_DIM, GeneratorConfig
 
 # Renders stand on white and are mostly white: without centring, the constant background drowns the object,
 # and the image trunk can die while the loss still falls (the codes alone then explain the data's mean shape).
-_IMAGE_MEAN, _IMAGE_GAIN = 0.9, 3.0
+IMAGE_MEAN, IMAGE_GAIN = 0.9, 3.0
 
 
 def prepare_images(images: Tensor, size: tuple[int, int]) -> Tensor:
     """(B, 3, H, W) in [0, 1] on white -> (B, 3, *size), resized without keeping the aspect, and centred."""
     if tuple(images.shape[-2:]) != size:
         images = F.interpolate(images, size=size, mode="bilinear", align_corners=False, antialias=True)
-    return (images - _IMAGE_MEAN) * _IMAGE_GAIN
+    return (images - IMAGE_MEAN) * IMAGE_GAIN
 
 
 def _widen(channels: int, factor: float) -> int:

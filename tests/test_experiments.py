@@ -14,7 +14,7 @@ from train.checkpoint import save_weights
 from train.config import InferenceConfig
 from train.errors import UserError
 from train.evaluate import evaluate
-from train.experiments import EXPERIMENTS, run_experiment
+from train.experiments import Workbench, run_experiment
 from train.experiments.agreement import WAYS, agreement
 
 _WAYS = {
@@ -67,7 +67,8 @@ def test_a_wrong_number_of_views_is_refused(
     views: int, smoke_run: Path, tiny_data: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(UserError, match=rf"between 2 and the 4 that .* got {views}"):
-        run_experiment("agreement", run=smoke_run, data=tiny_data, out=tmp_path, views=views, progress=False)
+        bench = Workbench((tiny_data,), tmp_path, "smoke", progress=False)
+        run_experiment("agreement", bench, run=smoke_run, views=views)
     assert not list(tmp_path.iterdir())
 
 
@@ -75,7 +76,6 @@ def test_a_network_without_codes_is_refused(tiny_data: Path, tmp_path: Path) -> 
     torch.manual_seed(0)
     weights = tmp_path / "plain.safetensors"
     save_weights(build_generator("smoke", deterministic=True), weights)
-    for name in EXPERIMENTS:
-        with pytest.raises(UserError, match="takes no codes"):
-            run_experiment(name, run=weights, data=tiny_data, out=tmp_path / "out", progress=False)
+    with pytest.raises(UserError, match="takes no codes"):
+        run_experiment("agreement", Workbench((tiny_data,), tmp_path / "out", progress=False), run=weights)
     assert not (tmp_path / "out").exists()

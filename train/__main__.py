@@ -151,36 +151,41 @@ class Evaluate:
 class Experiment:
     """Answer one question by measurement; writes NAME.json, NAME.md and NAME.png into --out.
 
-    agreement: what search and descent on the codes do to the error, for step sizes, steps, groups and restraints.
+    Trains what it needs, once for all experiments that write to the same place, and goes on where it was stopped.
+
+    deterministic: our system beside its counterpart without codes.
+    critic: with the latent critic and without.
+    stages: what stage 2, search and descent add.
+    views: the error from 1 to 8 images.
+    agreement: search and descent in detail: step sizes, steps, groups and restraints.
+    health: which choices keep a network listening to its image.
     """
 
-    name: Positional[Literal["agreement"]]
+    name: Positional[Literal["deterministic", "critic", "stages", "views", "agreement", "health"]]
     """Which one."""
-    run_: Annotated[Path, arg(name="run")]
-    """The trained run it is about: a directory, a .safetensors file, or the word `pretrained`."""
-    data: Path
-    """Root of a data tree."""
+    data: tuple[Path, ...]
+    """Root of a data tree; several are put together for training, and the first one's test split is scored (health:
+    each on its own)."""
     out: Path
     """Directory to write to."""
-    seeds: Numbers = (0, 1, 2)
-    """Seeds of codes and choice of views."""
-    views: int = 8
-    """Views per shape."""
+    profile: Literal["full", "cpu", "smoke"] = "cpu"
+    """Size of the networks, and how they are trained."""
+    seeds: int = 3
+    """Trainings of each system; for agreement, choices of codes and views."""
     limit: int | None = None
     """Use at most that many test shapes."""
+    steps: int | None = None
+    """The same number of steps for every phase, for a quick look."""
+    run_: Annotated[Path | None, arg(name="run")] = None
+    """agreement: the run it is about, a .safetensors file of one, or the word `pretrained`; trained if not given."""
+    views: int = 8
+    """agreement: views per shape."""
 
     def run(self) -> None:
-        from train.experiments import run_experiment
+        from train.experiments import Workbench, run_experiment
 
-        run_experiment(
-            self.name,
-            run=self.run_,
-            data=self.data,
-            out=self.out,
-            seeds=self.seeds,
-            views=self.views,
-            limit=self.limit,
-        )
+        bench = Workbench(self.data, self.out, self.profile, self.seeds, self.limit, self.steps)
+        run_experiment(self.name, bench, run=self.run_, views=self.views)
 
 
 @dataclasses.dataclass

@@ -1,38 +1,45 @@
-"""Questions answered by measurement, one a file. Each leaves NAME.json, NAME.md and NAME.png."""
+"""Questions answered by measurement. Each leaves NAME.json, NAME.md and NAME.png, and goes on where it was stopped."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from train.errors import UserError
 from train.experiments.agreement import agreement
+from train.experiments.health import health
+from train.experiments.paper import TABLES
+from train.experiments.table import make
+from train.experiments.workbench import Workbench
 
-EXPERIMENTS = {"agreement": agreement}
+__all__ = ["EXPERIMENTS", "Workbench", "run_experiment"]
 
 
-def run_experiment(
-    name: str,
-    *,
-    run: Path,
-    data: Path,
-    out: Path,
-    seeds: Sequence[int] = (0, 1, 2),
-    views: int = 8,
-    limit: int | None = None,
-    progress: bool = True,
-) -> dict[str, Any]:
+def _about_a_run(bench: Workbench, run: Path | None, views: int) -> dict[str, Any]:
+    if run is None:
+        run = bench.train(bench.config(lambda config: config, seed=0))
+    return agreement(
+        run, bench.data[0], bench.out, seeds=range(bench.seeds), views=views, limit=bench.limit,
+        progress=bench.progress,
+    )  # fmt: skip
+
+
+_TRAINING: dict[str, Callable[[Workbench], dict[str, Any]]] = {"health": health}
+_TRAINING |= {name: lambda bench, table=table: make(table, bench) for name, table in TABLES.items()}
+
+EXPERIMENTS = ("agreement", *_TRAINING)
+"""Names of all experiments."""
+
+
+def run_experiment(name: str, bench: Workbench, *, run: Path | None = None, views: int = 8) -> dict[str, Any]:
     """Runs one experiment and writes what it found.
 
     Args:
-        name: which one.
-        run: the trained run it is about, as `train.runs.open_run` takes it.
-        data: root of a data tree; its test split is used.
-        out: directory for NAME.json, NAME.md and NAME.png.
-        seeds: of codes and choice of views.
-        views: per shape.
-        limit: at most that many test shapes.
-        progress: show bars, and the table at the end.
+        name: one of `EXPERIMENTS`.
+        bench: data, profile and seeds, and where to write.
+        run: for "agreement", the trained run it is about, as `train.runs.open_run` takes it; trained here if not given.
+        views: for "agreement", per shape.
 
     Returns:
         What NAME.json holds.
@@ -40,4 +47,11 @@ def run_experiment(
     Raises:
         UserError: an unknown run, no usable data, or numbers out of range.
     """
-    return EXPERIMENTS[name](run, data, out, seeds=seeds, views=views, limit=limit, progress=progress)
+    if name == "agreement":
+        return _about_a_run(bench, run, views)
+    if run is not None:
+        raise UserError(f"the experiment {name} trains what it needs; leave --run out")
+    result = _TRAINING[name](bench)
+    if bench.progress:
+        print((bench.out / f"{name}.md").read_text())
+    return result

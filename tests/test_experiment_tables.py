@@ -1,0 +1,160 @@
+"""Tables of trainings: what is trained once stays, what is claimed is measured, what is undone is undone."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from models import build_generator
+from models.parts import prepare_images
+from train.checkpoint import best_weights
+from train.errors import UserError
+from train.experiments import Workbench, run_experiment
+from train.experiments.health import VARIANTS
+from train.experiments.paper import DETERMINISTIC, TABLES, deterministic
+from train.experiments.table import Expectation, Row, Table, confidence, make
+
+
+@pytest.fixture(scope="module")
+def bench(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Workbench:
+    """With both systems trained, two seeds each."""
+    out = tmp_path_factory.mktemp("bench")
+    bench = Workbench((tiny_data,), out, "smoke", seeds=2, limit=4, steps=3, progress=False)
+    for config in DETERMINISTIC.configs(bench):
+        bench.train(config)
+    return bench
+
+
+@pytest.fixture(autouse=True)
+def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tables as they are, with as many views as the test's data have."""
+    for name, table in TABLES.items():
+        rows = tuple(dataclasses.replace(row, views=min(row.views, 4)) for row in table.rows)
+        monkeypatch.setitem(TABLES, name, dataclasses.replace(table, rows=rows))
+
+
+def test_a_table_is_what_was_measured_and_is_made_once(bench: Workbench) -> None:
+    table = TABLES["deterministic"]
+    result = make(table, bench)
+    assert json.loads((bench.out / "deterministic.json").read_text()) == json.loads(json.dumps(result))
+    config = bench.config(deterministic, seed=1)
+    scores = bench.scores(config, config.inference, views=4)
+    assert result["rows"]["deterministic"]["by_seed"]["cd"][1] == pytest.approx(scores["cd"].mean().item())
+    row = result["rows"]["conditional"]
+    assert row["mean"]["cd"] == pytest.approx(sum(row["by_seed"]["cd"]) / 2)
+    assert row["by_seed"]["cd"][0] != row["by_seed"]["cd"][1]
+    expected = result["expectations"][0]
+    assert expected["gain"] == pytest.approx(
+        result["rows"]["deterministic"]["mean"]["cd"] - row["mean"]["cd"]
+    )
+    text = (bench.out / "deterministic.md").read_text()
+    assert f"{row['mean']['cd']:.2f} ± {row['sd']['cd']:.2f} (3.37)" in text
+    assert expected["verdict"] in text
+
+    before = {path: path.stat().st_mtime_ns for path in bench.out.glob("*/**/*") if path.is_file()}
+    assert make(table, bench) == result
+    after = {path: path.stat().st_mtime_ns for path in bench.out.glob("*/**/*") if path.is_file()}
+    assert after == before
+
+
+def test_tables_share_what_is_trained(bench: Workbench) -> None:
+    runs = set((bench.out / "runs").iterdir())
+    assert len(runs) == 4
+    made = make(TABLES["stages"], bench)
+    assert set((bench.out / "runs").iterdir()) == runs
+    agreed = made["rows"]["stages 1 and 2, agreed codes"]
+    assert agreed["consistency"]["descended"] < agreed["consistency"]["searched"]
+    other = dataclasses.replace(bench, steps=2)
+    assert not any(other.is_trained(config) for config in TABLES["stages"].configs(other))
+
+
+def test_an_interrupted_training_is_finished_to_the_same_weights(bench: Workbench) -> None:
+    config = bench.config(deterministic, seed=0)
+    run = bench.run_of(config)
+    weights = best_weights(run, 2).read_bytes()
+    (run / "trained.json").unlink()
+    assert not bench.is_trained(config)
+    assert bench.train(config) == run
+    assert best_weights(run, 2).read_bytes() == weights
+    assert json.loads((run / "trained.json").read_text())["continued"]
+
+
+def test_other_data_are_another_run(bench: Workbench, tiny_data: Path, tmp_path: Path) -> None:
+    config = bench.config(deterministic, seed=0)
+    for split in ("train", "val", "test"):
+        for path in (tiny_data / "data_list" / split).glob("*.list"):
+            target = tmp_path / "data_list" / split / path.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(path.read_text() + "03001627/another\n")
+    assert dataclasses.replace(bench, data=(tmp_path,)).run_of(config).name != bench.run_of(config).name
+
+
+def test_confidence_is_the_share_of_samples_with_a_gain() -> None:
+    random = torch.Generator().manual_seed(0)
+    noise = torch.randn(3, 200, generator=random, dtype=torch.float64)
+    noise -= noise.mean(1, keepdim=True)
+    assert confidence(noise + 1) == 1
+    assert confidence(-noise - 1) == 0
+    assert 0.35 < confidence(noise) < 0.65
+    # Trainings that disagree leave a doubt, however many shapes there are.
+    assert confidence(noise * 1e-3 + torch.tensor([[1.0], [1.0], [-1.5]])) < 0.9
+
+
+def test_a_verdict_says_what_the_numbers_say(bench: Workbench) -> None:
+    rows = (Row(name="network", views=4), Row(name="medoid", answer="medoid", views=4))
+    pairs = (Expectation("cd", "medoid", "network"), Expectation("cd", "network", "medoid"))
+    found = make(
+        Table(name="try", title="Untrained beside the medoid.", rows=rows, expectations=pairs), bench
+    )
+    verdicts = [expectation["verdict"] for expectation in found["expectations"]]
+    assert verdicts in (["holds", "does not hold"], ["does not hold", "holds"], ["undecided", "undecided"])
+    gains = [expectation["gain"] for expectation in found["expectations"]]
+    assert gains[0] == pytest.approx(-gains[1])
+    assert (gains[0] > 0) == (verdicts[0] == "holds") or verdicts[0] == "undecided"
+
+
+def test_health_compares_what_it_says(tiny_data: Path, tmp_path: Path) -> None:
+    bench = Workbench((tiny_data,), tmp_path, "smoke", seeds=1, steps=6, progress=False)
+    result = run_experiment("health", bench)
+    rows = result["trees"][tiny_data.name]
+    assert list(rows) == list(VARIANTS)
+    usual = rows["as it is"]
+    assert all(row["front"] != usual["front"] for name, row in rows.items() if name != "as it is")
+    assert f"| as it is | {usual['image'][0]:.2f} |" in (tmp_path / "health.md").read_text()
+    assert (tmp_path / "health.png").stat().st_size > 10_000
+    assert run_experiment("health", bench) == result
+
+
+def test_what_health_undoes_is_undone() -> None:
+    torch.manual_seed(0)
+    images = torch.rand(2, 3, 48, 64)
+    seen: list[torch.Tensor] = []
+    model = build_generator("smoke")
+    (uncentre,) = VARIANTS["images not centred"].network
+    uncentre(model)
+    first = model.trunk[1]
+    assert isinstance(first, torch.nn.Conv2d)
+    first.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    model.encode(images)
+    torch.testing.assert_close(seen[0], images)
+    assert (prepare_images(images, (48, 64)) - images).abs().max() > 0.1
+
+    (initialise,) = VARIANTS["torch's initialisation"].network
+    before = first.weight.std()
+    initialise(model)
+    assert first.weight.std() < 0.8 * before
+
+
+def test_wrong_requests_are_named(bench: Workbench, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="leave --run out"):
+        run_experiment("views", bench, run=tmp_path)
+    with pytest.raises(UserError, match="--seeds must be at least 1"):
+        dataclasses.replace(bench, seeds=0)
+    with pytest.raises(UserError, match="--limit must be at least 2"):
+        dataclasses.replace(bench, limit=1)
+    with pytest.raises(UserError, match="no data at"):
+        dataclasses.replace(bench, data=(tmp_path,)).run_of(bench.config(deterministic, seed=0))

@@ -1,0 +1,235 @@
+"""Which choices keep the network listening to its image? Short trainings, each with one choice undone.
+
+Every variant trains stage 1 for some steps and is measured as a run is: how far predictions move with the image and
+with the code, how much of the image trunk is silent, the validation error. What is undone is undone here: the product
+has no switch for it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from models import PROFILES as SIZES
+from models import Generator
+from models.parts import IMAGE_GAIN, IMAGE_MEAN
+from train import figures
+from train.batches import LoadedSplit, load_split
+from train.config import PROFILES, FitConfig, StageConfig
+from train.errors import UserError
+from train.experiments.paper import without_critic
+from train.experiments.workbench import Workbench
+from train.files import write_text
+from train.health import sensitivity
+from train.state import Training
+from train.validation import validate
+
+STEPS = 500
+_MEASUREMENTS = 10
+_IMAGES = 12
+
+
+class _Uncentred(nn.Module):
+    """Gives a trunk the images as they are, in [0, 1] and mostly white."""
+
+    def forward(self, centred: Tensor) -> Tensor:
+        return centred / IMAGE_GAIN + IMAGE_MEAN
+
+
+def _uncentre(generator: Generator) -> None:
+    generator.trunk.insert(0, _Uncentred())
+
+
+def _initialise_as_torch_does(generator: Generator) -> None:
+    for module in generator.modules():
+        if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
+            module.reset_parameters()
+
+
+def _no_warmup(stage: StageConfig) -> StageConfig:
+    return dataclasses.replace(stage, warmup=0)
+
+
+def _no_ramp(stage: StageConfig) -> StageConfig:
+    return dataclasses.replace(stage, ramp=(0, 1))
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One choice undone, or several: in the schedule, and in the network that was just drawn."""
+
+    stage: tuple[Callable[[StageConfig], StageConfig], ...] = ()
+    network: tuple[Callable[[Generator], None], ...] = ()
+
+
+VARIANTS: dict[str, Variant] = {
+    "as it is": Variant(),
+    "images not centred": Variant(network=(_uncentre,)),
+    "torch's initialisation": Variant(network=(_initialise_as_torch_does,)),
+    "no warm-up": Variant(stage=(_no_warmup,)),
+    "diversity from step one": Variant(stage=(_no_ramp,)),
+    "all four undone": Variant((_no_warmup, _no_ramp), (_uncentre, _initialise_as_torch_does)),
+}
+
+
+def health(bench: Workbench) -> dict[str, Any]:
+    """Trains every variant on every data tree with every seed; writes health.json, .md and .png.
+
+    Each tree is trained on alone. A training that is there already is not repeated.
+
+    Returns:
+        What health.json holds.
+    """
+    steps = bench.steps or STEPS
+    curves: dict[str, dict[str, list[list[dict[str, float]]]]] = {}
+    todo = len(bench.data) * len(VARIANTS) * bench.seeds
+    with tqdm(total=todo, unit="training", disable=not bench.progress) as bar:
+        for root in bench.data:
+            splits: list[LoadedSplit] = []
+            for name, variant in VARIANTS.items():
+                bar.set_description(f"{root.name}, {name}")
+                for seed in range(bench.seeds):
+                    found = _curve(bench, root, name, variant, seed=seed, steps=steps, splits=splits)
+                    curves.setdefault(root.name, {}).setdefault(name, []).append(found)
+                    bar.update()
+    result = {
+        "profile": bench.profile, "data": [str(root) for root in bench.data], "seeds": bench.seeds, "steps": steps,
+        "trees": {tree: {name: _summary(runs) for name, runs in rows.items()} for tree, rows in curves.items()},
+        "curves": curves,
+    }  # fmt: skip
+    write_text(bench.out / "health.json", json.dumps(result, indent=2) + "\n")
+    write_text(bench.out / "health.md", _markdown(result))
+    figures.save(_figure(result), bench.out / "health.png")
+    return result
+
+
+def _curve(
+    bench: Workbench,
+    root: Path,
+    name: str,
+    variant: Variant,
+    *,
+    seed: int,
+    steps: int,
+    splits: list[LoadedSplit],
+) -> list[dict[str, float]]:
+    """The measurements of one training, taken now or read; `splits` holds the tree once it has been needed."""
+    kept = bench.out / "health" / f"{root.name}-{name.replace(' ', '-')}-{steps}-seed{seed}.json"
+    if kept.exists():
+        return json.loads(kept.read_text())
+    base = bench.config(without_critic, seed=seed)
+    stage = base.stage1.lasting(steps)
+    for change in variant.stage:
+        stage = change(stage)
+    config = dataclasses.replace(base, stage1=stage)
+    if not splits:
+        splits += _read(bench, root, config)
+    found = _train(config, variant, *splits)
+    write_text(kept, json.dumps(found) + "\n")
+    return found
+
+
+def _read(bench: Workbench, root: Path, config: FitConfig) -> tuple[LoadedSplit, LoadedSplit]:
+    size = SIZES[bench.profile]
+    options = {
+        "image_size": (size.image_height, size.image_width), "map_size": config.map_size, "progress": False
+    }  # fmt: skip
+    val = load_split(root, "val", limit=config.validation_shapes, **options)
+    return load_split(root, "train", **options), val
+
+
+def _train(
+    config: FitConfig, variant: Variant, train: LoadedSplit, val: LoadedSplit
+) -> list[dict[str, float]]:
+    training = Training(config, train)
+    generator = training.learner.generator
+    for change in variant.network:
+        change(generator)
+    shapes = torch.arange(min(_IMAGES, len(val)))
+    images = val.float_images(shapes, torch.zeros(len(shapes), 1, dtype=torch.long))[:, 0]
+    found: list[dict[str, float]] = []
+    every = max(1, training.phase.steps // _MEASUREMENTS)
+    while not training.done:
+        try:
+            report = training.advance()
+        except UserError:  # no longer finite: that is an answer too
+            found.append({"step": training.step, "image": math.nan, "code": math.nan, "dead_share": math.nan})
+            break
+        if training.step % every == 0 or training.done:
+            now = sensitivity(generator, images, seed=config.seed)
+            record = {
+                "step": training.step,
+                "image": now.image,
+                "code": now.code,
+                "dead_share": now.dead_share,
+            }
+            found.append(record | {name: report[name].item() for name in ("front", "matched_share")})
+    found[-1] |= validate(generator, val, seed=config.seed)
+    return found
+
+
+def _summary(runs: list[list[dict[str, float]]]) -> dict[str, Any]:
+    """What each seed's training ended with."""
+    last = [run[-1] for run in runs]
+    names = ("image", "code", "dead_share", "matched_share", "front", "val_cd", "val_fps_cd")
+    return {name: [run.get(name, math.nan) for run in last] for name in names}
+
+
+def _markdown(result: Mapping[str, Any]) -> str:
+    head = (
+        f"Stage 1 of the profile `{result['profile']}`, {result['steps']} steps, {result['seeds']} seeds; what each "
+        "training ended with. Image, code: mean chamfer distance x100 between predictions of different images at one "
+        "code, and of different codes at one image. CD, FPS-CD: on the validation split, all views, random codes."
+    )
+    lines = [head]
+    columns = {
+        "image": "image", "code": "code", "dead_share": "silent", "matched_share": "matched", "val_cd": "CD",
+        "val_fps_cd": "FPS-CD",
+    }  # fmt: skip
+    for tree, rows in result["trees"].items():
+        lines += [
+            "",
+            f"| {tree} | " + " | ".join(columns.values()) + " |",
+            "| --- |" + " ---: |" * len(columns),
+        ]
+        for name, row in rows.items():
+            cells = [" / ".join(f"{value:.2f}" for value in row[column]) for column in columns]
+            lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join([*lines, ""])
+
+
+def _figure(result: Mapping[str, Any]) -> Figure:
+    """How far predictions move with the image, over the steps: a panel for each tree, a line for each training."""
+    trees = result["curves"]
+    figure = Figure(figsize=(6.5 * len(trees), 4.4), layout="constrained", dpi=110)
+    panels = figure.subplots(1, len(trees), squeeze=False)[0]
+    colours = ("#1f6f8b", "#c8553d", "#8a6d9e", "#dd9f63", "#5a9367", "#6b7785")
+    for axes, (tree, rows) in zip(panels, trees.items(), strict=True):
+        for (name, runs), colour in zip(rows.items(), colours, strict=False):
+            for number, run in enumerate(runs):
+                label = name if number == 0 else None
+                steps, image = [r["step"] for r in run], [r["image"] for r in run]
+                axes.plot(steps, image, ".-", color=colour, lw=1.1, label=label)
+        axes.axhline(
+            PROFILES[result["profile"]].min_image_sensitivity,
+            color=figures.MUTED,
+            ls=":",
+            label="a run is stopped below",
+        )
+        axes.set(
+            title=f"{tree}: does the image matter?", xlabel="step of stage 1",
+            ylabel="predictions of different images differ by (CD x100)",
+        )  # fmt: skip
+        axes.set_yscale("symlog", linthresh=0.1)
+        axes.legend(fontsize=8)
+    figure.suptitle(f"{result['seeds']} seeds of each, profile {result['profile']}", fontsize=11)
+    return figure

@@ -1,0 +1,181 @@
+"""What experiments share: runs that are trained once and scores that are taken once, whoever asks for them.
+
+    OUT/runs/KEY-seed0/    a run of `fit`; KEY comes from its configuration and its data. `trained.json` says it is done
+    OUT/scores/KEY.npz     one network on one split, with one choice of views and codes
+
+An experiment that is stopped goes on where it was when it is called again: `fit` resumes, finished scores are read.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from train.batches import LoadedSplit
+from train.checkpoint import best_weights, load_generator
+from train.config import PROFILES, FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
+from train.errors import UserError
+from train.files import replacing, write_text
+from train.fit import fit
+from train.runs import OpenRun
+from train.scoring import Scores, compare, score
+from train.trivial import medoid, nearest_by_image
+
+# What does not change a run's weights, and so not its name.
+_NO_PART_OF_A_KEY = (
+    "inference",
+    "seed",
+    "log_every",
+    "picture_every",
+    "checkpoint_every",
+    "keep_checkpoints",
+)
+
+Change = Callable[[FitConfig], FitConfig]
+"""How a variant's configuration differs from its profile's."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Workbench:
+    """Data, a profile and seeds; and a directory for what is made of them.
+
+    Attributes:
+        data: roots of the data trees, put together for training; the first one's test split is scored.
+        out: directory for runs and scores.
+        profile: size of the networks, and recipe of their training.
+        seeds: how many trainings of each variant, with seeds 0, 1, ...
+        limit: score at most that many test shapes.
+        steps: if given, the same number of steps for every phase, for a quick look.
+        progress: show bars.
+    """
+
+    data: tuple[Path, ...]
+    out: Path
+    profile: Profile = "cpu"
+    seeds: int = 3
+    limit: int | None = None
+    steps: int | None = None
+    progress: bool = True
+    _loaded: dict[tuple, LoadedSplit] = dataclasses.field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1:
+            raise UserError(f"--seeds must be at least 1; got {self.seeds}")
+        if self.limit is not None and self.limit < 2:
+            raise UserError(f"--limit must be at least 2, for a spread over shapes; got {self.limit}")
+
+    def config(self, change: Change, *, seed: int) -> FitConfig:
+        """The profile's configuration with a variant's changes."""
+        config = dataclasses.replace(change(PROFILES[self.profile]), seed=seed)
+        return config if self.steps is None else with_steps(config, self.steps)
+
+    def run_of(self, config: FitConfig) -> Path:
+        """Where a configuration's run is kept."""
+        values = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NO_PART_OF_A_KEY}
+        trees = [_tree_fingerprint(root) for root in self.data]
+        key = _digest(json.dumps([values, trees], sort_keys=True))
+        return self.out / "runs" / f"{key}-seed{config.seed}"
+
+    def is_trained(self, config: FitConfig) -> bool:
+        """Has a configuration's training come to its end?"""
+        return (self.run_of(config) / "trained.json").exists()
+
+    def train(self, config: FitConfig) -> Path:
+        """The run of a configuration: made now, continued, or there already.
+
+        Raises:
+            KeyboardInterrupt: a signal ended the training early; it has saved.
+        """
+        run = self.run_of(config)
+        if self.is_trained(config):
+            return run
+        saved = run / "config.json"
+        begun = saved.exists()
+        if begun:
+            config = fit_config_from_json(saved.read_text(), where=str(saved))
+        start = time.monotonic()
+        if not fit(self.data, run, config, resume=begun, progress=self.progress):
+            raise KeyboardInterrupt
+        seconds = round(time.monotonic() - start)
+        write_text(run / "trained.json", json.dumps({"seconds": seconds, "continued": begun}) + "\n")
+        return run
+
+    def scores(
+        self,
+        config: FitConfig,
+        settings: InferenceConfig,
+        *,
+        stage: Literal[1, 2] = 2,
+        views: int,
+        split: Literal["val", "test"] = "test",
+    ) -> Scores:
+        """Figure -> (M,) of a configuration's network, trained if need be. Codes and views are drawn by its seed."""
+        run = self.train(config)
+        data = self._data(config, split)
+
+        def take() -> Scores:
+            model = load_generator(best_weights(run, stage))
+            found = score(model, data, settings, views=views, seed=config.seed)
+            return {name: values.double() for name, values in found.items()}
+
+        key = [run.name, stage, dataclasses.asdict(settings), views, split, data.fingerprint]
+        return self._kept(key, take)
+
+    def trivial_scores(
+        self, answer: Literal["medoid", "nearest image"], config: FitConfig, *, views: int
+    ) -> Scores:
+        """Figure -> (M,) of an answer that needs no network, for the data that a configuration sees."""
+        test = self._data(config, "test")
+
+        def take() -> Scores:
+            train = self._data(config, "train")
+            points = load_generator(best_weights(self.train(config), 2)).points
+            if answer == "medoid":
+                clouds = train.points[medoid(train.points)].expand_as(test.points)
+            else:
+                clouds = train.points[nearest_by_image(test, train, views=(views,))[views]]
+            parts = zip(clouds.split(16), test.points.split(16), strict=True)
+            found = [compare(cloud.contiguous(), truth, points=points) for cloud, truth in parts]
+            return {name: torch.cat([part[name] for part in found]).double() for name in found[0]}
+
+        return self._kept([answer, self.run_of(config).name, views, test.fingerprint], take)
+
+    def _data(self, config: FitConfig, split: Literal["train", "val", "test"]) -> LoadedSplit:
+        """A split of the first tree as a configuration reads it."""
+        model = load_generator(best_weights(self.train(config), 2))
+        sizes = (model.config.image_height, model.config.image_width, config.map_size, config.gt_pool)
+        key = (split, *sizes, config.categories)
+        if key not in self._loaded:
+            limit = self.limit if split != "train" else None
+            opened = OpenRun(model, config, None)
+            self._loaded[key] = opened.load_split(self.data[0], split, limit=limit, progress=self.progress)
+        return self._loaded[key]
+
+    def _kept(self, key: Sequence[object], take: Callable[[], Scores]) -> Scores:
+        path = self.out / "scores" / f"{_digest(json.dumps(key, sort_keys=True))}.npz"
+        if not path.exists():
+            found = take()
+            with replacing(path) as temporary, temporary.open("wb") as file:
+                np.savez(file, allow_pickle=False, **{name: v.numpy() for name, v in found.items()})
+        with np.load(path) as file:
+            return {name: torch.from_numpy(file[name]) for name in file.files}
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _tree_fingerprint(root: Path) -> str:
+    """Changes when a tree's lists, or what it was made with, change; nothing is read but those."""
+    files = sorted(root.glob("data_list/*/*.list")) + sorted(root.glob("made_with.json"))
+    if not files:
+        raise UserError(f"no data at {root}; make some with: python -m train data procedural --out {root}")
+    return _digest("\n".join(f"{path.relative_to(root)}\n{path.read_text()}" for path in files))
