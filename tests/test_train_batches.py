@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from diffpoint import PinholeCamera, unproject
-from train.batches import Sampler, decimate_depth, load_split, min_pool_depth
+from train.batches import Sampler, load_split
 from train.data.procedural import generate
+from train.data.shrink import decimate_depth, min_pool_depth
 from train.errors import UserError
 
 
@@ -100,7 +101,9 @@ def test_several_trees_are_put_together_whatever_the_size_of_their_renders(
         for root in (tiny_data, other)
     ]
     assert both.ids == alone[0].ids + alone[1].ids
-    assert torch.equal(both.depth, torch.cat([split.depth for split in alone]))
+    assert torch.equal(
+        torch.stack([*both.depth]), torch.stack([depth for split in alone for depth in split.depth])
+    )
     few = load_split([tiny_data, other], "train", image_size=(48, 64), map_size=16, limit=4, progress=False)
     assert set(few.categories) == set(both.categories)
 

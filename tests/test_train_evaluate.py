@@ -87,7 +87,7 @@ def test_the_nearest_image_of_a_known_shape_is_its_own(tiny_data: Path) -> None:
     split = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, progress=False)
     found = nearest_by_image(split, split, views=(1, 4))
     assert all(index.tolist() == list(range(len(split))) for index in found.values())
-    shuffled = dataclasses.replace(split, images=split.images.flip(0))
+    shuffled = dataclasses.replace(split, images=list(split.images)[::-1])
     found = nearest_by_image(shuffled, split, views=(2,))
     assert found[2].tolist() == list(reversed(range(len(split))))
 

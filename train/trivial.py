@@ -42,7 +42,7 @@ def nearest_by_image(test: LoadedSplit, train: LoadedSplit, *, views: Sequence[i
     Returns:
         For each n of `views`, (M_test,) numbers of training shapes.
     """
-    known = train.images.flatten(2).flatten(0, 1).float() / 255
+    known = torch.stack(tuple(train.images)).flatten(2).flatten(0, 1).float() / 255
     known_squared = known.square().sum(1)
     smallest = []
     for images in test.images:
