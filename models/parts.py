@@ -23,6 +23,11 @@ def prepare_images(images: Tensor, size: tuple[int, int]) -> Tensor:
     return (images - IMAGE_MEAN) * IMAGE_GAIN
 
 
+def full_precision(like: Tensor) -> torch.autocast:
+    """A context for layers that write coordinates: bfloat16 would round them to 1/500 of an object's size."""
+    return torch.autocast(like.device.type, enabled=False)
+
+
 def _widen(channels: int, factor: float) -> int:
     return max(4, round(channels * factor))
 
@@ -102,7 +107,9 @@ class LatentDecoder(_Narrowing):
         self.latent = nn.Linear(self.fc_width, LATENT_DIM)
 
     def forward(self, joined: Tensor) -> Tensor:
-        return self.latent(self.narrow(joined)[-1])
+        vector = self.narrow(joined)[-1]
+        with full_precision(joined):
+            return self.latent(vector.float())
 
 
 class PointDecoder(_Narrowing):
@@ -124,15 +131,16 @@ class PointDecoder(_Narrowing):
 
     def forward(self, joined: Tensor) -> Tensor:
         x4, x5, bottleneck, vector = self.narrow(joined)
-        fc_points = self.fc_points(vector).unflatten(1, (-1, 3))
 
         x = self.merge5(F.relu(_crop(self.up5(bottleneck), x5) + self.skip5(x5)))
         x = self.merge4(F.relu(_crop(self.up4(x), x4) + self.skip4(x4)))
         # The ReLU before this one sum is in the released network (and in PSGN's); the other two sums have
         # none.
         x = self.merge3(F.relu(F.relu(_crop(self.up3(x), joined)) + self.skip3(joined)))
-        conv_points = self.conv_points(x).permute(0, 2, 3, 1).reshape(len(joined), -1, 3)
-        return torch.cat([fc_points, conv_points], dim=1)
+        with full_precision(joined):
+            fc_points = self.fc_points(vector.float()).unflatten(1, (-1, 3))
+            conv_points = self.conv_points(x.float()).permute(0, 2, 3, 1).reshape(len(joined), -1, 3)
+            return torch.cat([fc_points, conv_points], dim=1)
 
 
 def _joined_channels(config: GeneratorConfig) -> int:

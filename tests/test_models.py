@@ -116,3 +116,23 @@ def test_wrong_arguments_are_named() -> None:
         model(torch.rand(3, 64, 64), torch.randn(1, 1, model.code_dim))
     with pytest.raises(ValueError, match="'codes'"):
         model(torch.rand(2, 3, 64, 64), torch.randn(1, 3, model.code_dim))
+
+
+@pytest.mark.parametrize("ending", ["points", "latent"])
+def test_bfloat16_predicts_nearly_the_same_points_in_full_resolution(ending):
+    torch.manual_seed(0)
+    model = build_generator("smoke", ending=ending)
+    with torch.no_grad():
+        for parameter in model.parameters():  # clouds as large as objects
+            parameter.mul_(1.2)
+    images, codes = torch.rand(2, 3, 48, 64), torch.randn(3, 2, model.code_dim)
+    exact = model(images, codes)
+    model.computes_in = torch.bfloat16
+    rough = model(images, codes)
+    assert rough.dtype == torch.float32
+    assert not torch.equal(rough, rough.bfloat16().float())
+    assert 0 < (rough - exact).abs().mean() < 0.02 * exact.std()
+    rough.square().sum().backward()
+    trunk = next(model.trunk.parameters())
+    assert trunk.grad is not None and trunk.grad.dtype == torch.float32
+    assert trunk.grad.abs().sum() > 0
