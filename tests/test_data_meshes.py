@@ -10,7 +10,10 @@ import trimesh
 from PIL import Image
 
 from train.data import ShapeTree, store
-from train.data.meshes import MeshError, convert, load_surface
+from train.data.hidden import sample_seen
+from train.data.meshes import LEFT_OUT, MeshError, MeshOptions, MeshReport, convert, load_surface
+from train.data.rasterise import Rasteriser
+from train.data.render import Orbit, Renderer, draw_camera
 from train.data.sources import find_meshes, read_labels, shape_ids
 from train.errors import UserError
 
@@ -235,3 +238,160 @@ def test_the_shipped_furniture_labels_are_whole():
     assert len(labels) == 246
     assert len({(label.library, label.model) for label in labels}) == 246
     assert len({label.synset for label in labels}) == 12
+
+
+def test_one_triangle_is_refused_as_flat_and_a_thin_board_is_not(tmp_path):
+    (tmp_path / "triangle.obj").write_text("v 0 0 0\nv 1 0.3 0.2\nv 0 1 0.5\nf 1 2 3\n")
+    with pytest.raises(MeshError, match="flat: all its faces lie in one plane"):
+        load_surface(tmp_path / "triangle.obj")
+    save_box(tmp_path / "board.obj", (1.0, 2.0, 0.001))
+    assert len(load_surface(tmp_path / "board.obj").faces) == 12
+
+
+def test_what_is_too_thin_for_its_pixels_is_named(tmp_path):
+    save_box(tmp_path / "in" / "needle.obj", (1.0, 0.0002, 0.0002))
+    save_box(tmp_path / "in" / "box.obj")
+    report = convert([tmp_path / "in"], tmp_path / "out", size=16, views=4, processes=1)
+    assert report.made == 1
+    assert "shows nothing of it" in report.failures["in: needle.obj"]
+
+
+def test_a_file_that_is_too_large_is_not_even_opened(tmp_path):
+    with (tmp_path / "huge.ply").open("wb") as file:
+        file.truncate(300 << 20)  # a hole: no space is taken
+    with pytest.raises(MeshError, match="larger than 256 MB"):
+        load_surface(tmp_path / "huge.ply")
+
+
+def test_what_was_left_out_is_written_down(tmp_path):
+    bad = tmp_path / "in" / "bad, or not.obj"
+    save_box(tmp_path / "in" / "good.obj")
+    bad.write_text("nothing")
+    convert([tmp_path / "in"], tmp_path / "out", **SMALL)
+    with (tmp_path / "out" / LEFT_OUT).open(newline="") as file:
+        assert list(csv.reader(file)) == [["mesh", "reason"], ["in: bad, or not.obj", "no faces"]]
+    bad.unlink()
+    convert([tmp_path / "in"], tmp_path / "out", **SMALL)
+    assert not (tmp_path / "out" / LEFT_OUT).exists()
+
+
+def test_a_long_list_is_cut_on_the_terminal(tmp_path):
+    failures = {f"mesh {i:02d}": "no faces" for i in range(50)}
+    lines = MeshReport(tmp_path, 1, 2, 3, {"train": 6}, {"chair": 6}, failures).summary().splitlines()
+    assert "made 1 shapes, 2 were there, 3 are not from these sources" in lines[0]
+    assert lines[1] == "50 meshes were left out:"
+    assert lines[-1] == f"  and 30 others; {tmp_path / LEFT_OUT} names all"
+
+
+def test_other_settings_into_the_same_folder_are_refused(tmp_path):
+    save_box(tmp_path / "in" / "a.obj")
+    convert([tmp_path / "in"], tmp_path / "out", **SMALL)
+    for options, message in (
+        (MeshOptions(up="z"), "up 'y' there, 'z' now"),
+        (MeshOptions(scale=0.1), "scale None there, 0.1 now"),
+        (MeshOptions(drop_hidden=True), "drop hidden False there, True now"),
+        (MeshOptions(orbit=Orbit(elevation_deg=(0.0, 10.0))), "elevation"),
+        (MeshOptions(orbit=Orbit(distance=3.0)), "distance 2.0 there, 3.0 now"),
+        (MeshOptions(orbit=Orbit(focal=1.5)), "focal"),
+    ):
+        with pytest.raises(UserError, match=message):
+            convert([tmp_path / "in"], tmp_path / "out", options=options, **SMALL)
+    assert len(all_shapes(tmp_path / "out")) == 1
+
+
+def test_other_sources_into_the_same_folder_are_added_and_counted(tmp_path):
+    for name in ("a", "b"):
+        save_box(tmp_path / name / "model.obj")
+        report = convert(
+            [tmp_path / name], tmp_path / "out", options=MeshOptions(category=f"{name} kind"), **SMALL
+        )
+    assert (report.made, report.kept, report.others) == (1, 0, 1)
+    assert report.categories == {"a_kind": 1, "b_kind": 1}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (MeshOptions(up="w"), "up must be one of y, z, x, -y"),
+        (MeshOptions(scale=0.0), "scale must be positive"),
+        (MeshOptions(orbit=Orbit(distance=1.0)), "the frame cuts shapes"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(tmp_path, options, message):
+    save_box(tmp_path / "a.obj")
+    with pytest.raises(UserError, match=message):
+        convert([tmp_path / "a.obj"], tmp_path / "out", options=options, **SMALL)
+    assert not (tmp_path / "out").exists()
+
+
+def test_labels_and_category_are_one_too_many(tmp_path):
+    save_box(tmp_path / "a.obj")
+    with pytest.raises(UserError, match="give one of them"):
+        convert(
+            [tmp_path], tmp_path / "out", labels=tmp_path / "x.csv", options=MeshOptions(category="chair")
+        )
+
+
+def test_the_up_axis_and_the_cameras_reach_the_views(tmp_path):
+    """A mast along z, seen from the horizon: upright in the pictures, and as large as distance and focal say."""
+    save_box(tmp_path / "mast.obj", (0.1, 0.1, 2.0))
+    orbit = Orbit(elevation_deg=(0.0, 0.0), distance=4.0, focal=3.0)
+    convert(
+        [tmp_path / "mast.obj"],
+        tmp_path / "out",
+        size=128,
+        views=3,
+        processes=1,
+        options=MeshOptions(up="z", orbit=orbit),
+    )
+    (shape,) = all_shapes(tmp_path / "out")
+    for mask in np.isfinite(shape.depth.numpy()):
+        rows, columns = np.argwhere(mask).T
+        assert abs(np.ptp(rows) + 1 - 3 * 128 / 4) < 4
+        assert np.ptp(columns) < 12
+    assert np.ptp(shape.points.numpy(), axis=0).argmax() == 1
+
+
+def test_a_scale_keeps_sizes_apart_and_refuses_what_the_frame_would_cut(tmp_path):
+    for name, side in (("small", 100.0), ("large", 200.0), ("huge", 900.0)):  # say, in millimetres
+        save_box(tmp_path / "in" / f"{name}.obj", (side, side, side))
+    report = convert([tmp_path / "in"], tmp_path / "out", options=MeshOptions(scale=0.002), **SMALL)
+    sides = {
+        shape.id.split("/")[1]: np.ptp(shape.points.numpy(), axis=0) for shape in all_shapes(tmp_path / "out")
+    }
+    np.testing.assert_allclose(sides["small"], 0.2, atol=1e-3)
+    np.testing.assert_allclose(sides["large"], 0.4, atol=1e-3)
+    assert list(report.failures) == ["in: huge.obj"]
+    assert "radius is 1.56 world units and the frame holds 0.52" in report.failures["in: huge.obj"]
+
+
+def test_hidden_points_are_dropped_as_an_option(tmp_path):
+    """A closed box in an open one: nothing of what is in the closed box, but the open one's inside."""
+    parts = []
+    for extents, inner in (((0.4, 0.4, 0.4), True), ((0.3, 0.3, 0.3), True), ((1.0, 1.0, 1.0), False)):
+        part = trimesh.creation.box(extents)
+        if not inner:
+            part.update_faces(~np.isclose(part.triangles_center[:, 1], 0.5))  # no lid
+        parts.append(part)
+    (tmp_path / "in").mkdir()
+    trimesh.util.concatenate(parts).export(tmp_path / "in" / "boxes.ply")
+    for name, drop in (("all", False), ("seen", True)):
+        convert([tmp_path / "in"], tmp_path / name, options=MeshOptions(drop_hidden=drop), **SMALL)
+    every, seen = (all_shapes(tmp_path / name)[0].points.numpy() * np.sqrt(3) for name in ("all", "seen"))
+    reach = np.abs(every).max(1)
+    assert np.isclose(reach, 0.15, atol=1e-3).sum() > 100  # the innermost box
+    reach = np.abs(seen).max(1)
+    assert len(seen) == store.POINTS
+    assert not np.isclose(reach, 0.15, atol=1e-3).any()
+    assert np.isclose(reach, 0.2, atol=1e-3).sum() > 100  # the closed box, seen through the open side
+    share = np.isclose(reach, 0.5, atol=1e-3).mean()
+    assert abs(share - 5 / (5 + 6 * 0.16)) < 0.05  # all five walls, by area
+
+
+def test_hidden_points_without_embree(tmp_path):
+    outer, inner = trimesh.creation.box((0.5, 0.5, 0.5)), trimesh.creation.icosphere(2, radius=0.2)
+    trimesh.util.concatenate([outer, inner]).export(tmp_path / "a.ply")
+    renderer = Renderer(load_surface(tmp_path / "a.ply"), Rasteriser)
+    camera = draw_camera(np.random.default_rng(0), 2, 64)
+    points = sample_seen(renderer, camera, 300, np.random.default_rng(0))
+    np.testing.assert_allclose(np.abs(points).max(1), 0.5 / np.sqrt(3), atol=1e-6)

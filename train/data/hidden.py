@@ -9,7 +9,7 @@ from train.data.mesh_files import MeshError
 from train.data.render import Orbit, Renderer, orbit_camera
 from train.data.surface import sample_triangles
 
-_CAMERAS, _SIZE = 96, 448
+_CAMERAS, _SIZE = 64, 320
 _DRAWN_AT_ONCE = 4  # for each point that is wanted
 _ROUNDS = 8
 _SAME, _NEAR = 1e-4, 0.02
@@ -23,7 +23,7 @@ def sample_seen(
     """Points (count, 3), uniform by area on what can be seen of the surface.
 
     The bottoms of drawers, and what of a part is inside another, are left out: no picture shows them. A point is seen
-    if one of the views' cameras (V,) sees it, or one of 96 cameras all around.
+    if one of the views' cameras (V,) sees it, or one of 64 cameras all around.
 
     Raises:
         MeshError: nearly nothing of the surface can be seen.

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from PIL import Image
+from trimesh.resolvers import FilePathResolver
 from trimesh.visual import ColorVisuals, TextureVisuals
 
 from train.data.surface import Surface
@@ -27,7 +28,11 @@ class MeshError(Exception):
 
 
 def load_surface(
-    path: Path, rotation: Sequence[float] | None = None, *, scale: float | None = None
+    path: Path,
+    rotation: Sequence[float] | None = None,
+    *,
+    scale: float | None = None,
+    root: Path | None = None,
 ) -> Surface:
     """Load a mesh, turn it, and centre its bounding box on the origin.
 
@@ -35,6 +40,8 @@ def load_surface(
         path: the file.
         rotation: 9 numbers, row by row; None leaves it as it stands.
         scale: world units per unit of the file; None makes the diagonal of the bounding box 1, as ShapeNet does.
+        root: folder below which its materials and textures may be; by default that above the file's, for ShapeNet's
+            second version names textures `../images/...`.
 
     Raises:
         MeshError: no faces, coordinates that are no numbers, no extent in one of the three directions (as one triangle
@@ -43,7 +50,11 @@ def load_surface(
     if path.stat().st_size > _LARGEST_FILE:
         raise MeshError(f"larger than {_LARGEST_FILE >> 20} MB: make it coarser")
     try:
-        scene = trimesh.load(path, force="scene", process=False)
+        files = _Files(path, root or path.parent.parent)
+        with path.open("rb") as file:
+            scene = trimesh.load(
+                file, file_type=path.suffix[1:].lower(), resolver=files, force="scene", process=False
+            )
         parts = _parts(scene)  # pyright: ignore[reportArgumentType]
     except MeshError:
         raise
@@ -72,6 +83,22 @@ def load_surface(
     if scale is not None:
         corners *= diagonal * scale
     return dataclasses.replace(surface, vertices=corners, faces=np.arange(len(corners)).reshape(-1, 3))
+
+
+class _Files(FilePathResolver):
+    """Finds the files that a mesh names: beside it or elsewhere below a folder, with slashes of either kind."""
+
+    def __init__(self, path: Path, root: Path) -> None:
+        super().__init__(str(path))
+        self._root = root.resolve()
+
+    def get(self, name: str) -> bytes:
+        name = name.strip().replace("\\", "/")
+        for candidate in (name, name.lstrip("/"), name.rpartition("/")[2]):
+            path = Path(self.parent, candidate).resolve()
+            if path.is_relative_to(self._root) and path.is_file():
+                return path.read_bytes()
+        raise FileNotFoundError(name)
 
 
 def _parts(scene: trimesh.Scene) -> list[Surface]:

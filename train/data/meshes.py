@@ -223,7 +223,7 @@ def _convert_one(job: _Job) -> int | Exception:
         return 0
     options = job.options
     try:
-        surface = load_surface(job.mesh.path, job.mesh.rotation, scale=options.scale)
+        surface = load_surface(job.mesh.path, job.mesh.rotation, scale=options.scale, root=job.mesh.root)
         radius = float(np.linalg.norm(surface.vertices, axis=1).max())
         if options.scale is not None and radius > options.orbit.max_radius:
             raise MeshError(

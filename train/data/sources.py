@@ -60,6 +60,12 @@ class MeshFile:
         """What messages call it."""
         return f"{self.library}: {self.inside}"
 
+    @property
+    def root(self) -> Path:
+        """The folder that holds all it may need: its library's, and at least the one above its own."""
+        parents = self.path.resolve().parents
+        return parents[min(max(len(PurePosixPath(self.inside).parts) - 1, 1), len(parents) - 1)]
+
 
 @dataclasses.dataclass(frozen=True)
 class Label:
