@@ -13,15 +13,16 @@ import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 from tyro.constructors import PrimitiveConstructorSpec
 
-from train.config import PROFILES, FitConfig, fit_config_from_json, with_steps, with_variant
+from train.config import PROFILES, FitConfig, System, fit_config_from_json, with_steps, with_variant
 from train.data_commands import Data
 from train.errors import UserError
+from train.recipes import with_system
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
 
@@ -244,6 +245,9 @@ def _fit_defaults(arguments: list[str]) -> FitConfig:
     if arguments[:1] == ["fit"] and "--resume" in arguments and saved.is_file():
         return fit_config_from_json(saved.read_text(), where=str(saved))
     profile = PROFILES.get(given.get("--profile", "cpu"), PROFILES["cpu"])
+    for system in get_args(System):
+        if given.get("--system") == system:
+            profile = with_system(profile, system)
     return with_variant(profile, "highly-diverse") if given.get("--variant") == "highly-diverse" else profile
 
 

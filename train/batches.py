@@ -76,6 +76,11 @@ class LoadedSplit:
         camera = PinholeCamera(self.K[picked], self.cam_from_world[picked], size, size)
         return Batch(self.float_images(shapes, views), _picked(self.depth, shapes, views), camera)
 
+    def truth(self, shapes: Tensor) -> Truth:
+        """(B,) shape numbers -> everything known of them."""
+        seen = self.batch(shapes, torch.arange(self.views).expand(len(shapes), -1))
+        return Truth(self.points[shapes], seen.depth, seen.camera)
+
     def clouds(self, shapes: Tensor, points: Tensor) -> Tensor:
         """(B,) shape and (B, N) point numbers -> (B, N, 3) of the ground truth."""
         return self.points[shapes[:, None], points]
@@ -84,6 +89,20 @@ class LoadedSplit:
 def _picked(values: Sequence[Tensor] | Tensor, shapes: Tensor, views: Tensor) -> Tensor:
     """M of (V, ...), (B,) shape and (B, V') view numbers -> (B, V', ...)."""
     return torch.stack([values[shape][chosen] for shape, chosen in zip(shapes.tolist(), views, strict=True)])
+
+
+class Truth(NamedTuple):
+    """Everything known of B shapes, with all V views that the data have of them.
+
+    Attributes:
+        points: (B, P, 3) on the surface, world frame.
+        depth: (B, V, S, S) metric depth, +inf where empty.
+        camera: (B, V), of the depth maps.
+    """
+
+    points: Tensor
+    depth: Tensor
+    camera: PinholeCamera
 
 
 class Batch(NamedTuple):
@@ -95,12 +114,14 @@ class Batch(NamedTuple):
         camera: (B, V), of the depth maps.
         real: (K, B, N, 3) ground truth clouds for the critic, first those of the B shapes, then of others; None
             without a critic.
+        truth: the same shapes, for methods that are taught with more than the images' own depth maps; else None.
     """
 
     images: Tensor
     depth: Tensor
     camera: PinholeCamera
     real: Tensor | None = None
+    truth: Truth | None = None
 
 
 def load_split(

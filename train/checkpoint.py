@@ -15,7 +15,7 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -28,12 +28,26 @@ from models import (
     Critic,
     Generator,
     GeneratorConfig,
+    Predictor,
     build_autoencoder,
     build_generator,
+)
+from models.baselines import (
+    LinConfig,
+    PTNConfig,
+    R2N2Config,
+    RecurrentReconstruction,
+    SilhouetteReconstruction,
+    StructureGenerator,
+    build_lin,
+    build_ptn,
+    build_r2n2,
 )
 from train.config import PROFILES, FitConfig, fit_config_from_json
 from train.errors import UserError
 from train.files import remove, replacing
+from train.recipes import with_system
+from train.systems import system_of
 
 _Network = TypeVar("_Network", bound=nn.Module)
 
@@ -42,7 +56,11 @@ _KINDS = {
     Generator: ("diffpoint.generator", lambda c: build_generator(config=GeneratorConfig(**c))),
     Autoencoder: ("diffpoint.autoencoder", lambda c: build_autoencoder(config=AutoencoderConfig(**c))),
     Critic: ("diffpoint.critic", lambda c: Critic(**c)),
+    StructureGenerator: ("diffpoint.lin", lambda c: build_lin(config=LinConfig(**c))),
+    RecurrentReconstruction: ("diffpoint.r2n2", lambda c: build_r2n2(config=R2N2Config(**c))),
+    SilhouetteReconstruction: ("diffpoint.ptn", lambda c: build_ptn(config=PTNConfig(**c))),
 }
+_PREDICTORS = (Generator, StructureGenerator, RecurrentReconstruction, SilhouetteReconstruction)
 
 
 def best_weights(run: Path, phase: int | str) -> Path:
@@ -75,6 +93,16 @@ def load_generator(run_or_file: str | Path) -> Generator:
     return _read(_weights_of_run(path) if path.is_dir() else path, Generator).eval()
 
 
+def load_predictor(run_or_file: str | Path) -> Predictor:
+    """As `load_generator`, of any system: the network of a run, or of a file, whatever it is.
+
+    Raises:
+        UserError: there is nothing of the kind, or it cannot be read.
+    """
+    path = Path(run_or_file)
+    return cast(Predictor, _read(_weights_of_run(path) if path.is_dir() else path, *_PREDICTORS)).eval()
+
+
 def load_autoencoder(run_or_file: str | Path) -> Autoencoder:
     """Loads the best auto-encoder of a run, or that of a file, in eval mode and frozen.
 
@@ -85,12 +113,15 @@ def load_autoencoder(run_or_file: str | Path) -> Autoencoder:
     return _read(best_weights(path, "autoencoder") if path.is_dir() else path, Autoencoder).freeze()
 
 
-def config_of(run_or_file: str | Path, model: Generator) -> FitConfig:
-    """The configuration of a run, or for a lone file of weights that of its profile."""
+def config_of(run_or_file: str | Path, model: Predictor) -> FitConfig:
+    """The configuration of a run, or for a lone file of weights that of its profile and system."""
     file = Path(run_or_file) / "config.json"
     if file.exists():
         return fit_config_from_json(file.read_text(), where=str(file))
-    return dataclasses.replace(PROFILES[model.profile], deterministic=model.config.deterministic)
+    profile = PROFILES[model.profile]
+    if not isinstance(model, Generator):
+        return with_system(profile, system_of(model))
+    return dataclasses.replace(profile, deterministic=model.config.deterministic)
 
 
 def _weights_of_run(run: Path) -> Path:
@@ -107,22 +138,29 @@ def _weights_of_run(run: Path) -> Path:
     )
 
 
-def _read(path: Path, kind: type[_Network]) -> _Network:
-    name, build = _KINDS[kind]
+def _read(path: Path, *kinds: type[_Network]) -> _Network:
+    """The network in a file, which is one of these kinds."""
     if not path.exists():
         raise UserError(f"{path} does not exist; name a run that `fit` wrote, or a .safetensors file of one")
     try:
         with safe_open(path, framework="pt") as file:
-            header = (file.metadata() or {}).get(name)
+            headers = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-        if header is None:
-            raise ValueError(f"it has no {name} header")
-        model = build(json.loads(header))
+        found = [_KINDS[kind] for kind in kinds if _KINDS[kind][0] in headers]
+        if not found:
+            raise ValueError(f"it has no {_KINDS[kinds[0]][0]} header")
+        name, build = found[0]
+        model = build(_with_tuples(json.loads(headers[name])))
         model.load_state_dict(tensors)
     except (SafetensorError, OSError, ValueError, TypeError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise UserError(f"{path} holds no {kind.__name__.lower()}'s weights ({reason})") from None
+        raise UserError(f"{path} holds no {kinds[0].__name__.lower()}'s weights ({reason})") from None
     return model
+
+
+def _with_tuples(config: dict[str, Any]) -> dict[str, Any]:
+    """JSON knows lists only; configurations hold tuples."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in config.items()}
 
 
 def save_checkpoint(

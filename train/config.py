@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Profile = Literal["full", "cpu", "smoke"]
 Variant = Literal["standard", "highly-diverse"]
 Ending = Literal["points", "latent"]
+System = Literal["ours", "psgn", "psgn-mon", "front-mon", "lin", "r2n2", "ptn"]
 
 # The paper's alpha multiplies the released code's approximate EMD: a sum over 2048 points, about 1.3 times
 # the exact optimum. Ours is exact and a mean, so that it means the same at any number of points.
@@ -50,7 +51,12 @@ class Schedule:
         return warm * (final + (first - final) * share_left)
 
     def lasting(self, steps: int) -> Self:
-        """The same phase in so many steps; what happens at a certain step happens earlier or later with it."""
+        """The same phase in so many steps; what happens at a certain step happens earlier or later with it.
+
+        A phase of no steps stays one.
+        """
+        if self.steps == 0:
+            return self
         return dataclasses.replace(self, steps=steps, warmup=round(self.warmup * steps / self.steps))
 
 
@@ -76,7 +82,8 @@ class StageConfig(Schedule):
     """False: each image's cloud meets its own depth map. True: the clouds of a shape's views are concatenated
     first and the whole meets the depth map of each view."""
     front: Literal["emd", "chamfer"]
-    """Distance of the front constraint: earth mover's (sum over matched points) or chamfer (mean x100)."""
+    """Distance of the front constraint: earth mover's (sum over matched points) or chamfer (mean x100). A system that
+    is taught with whole clouds compares them by it (mean x100)."""
     alpha: float
     """The paper's alpha: how much a change of code must change the shape (in the unit of the released
     code)."""
@@ -88,8 +95,9 @@ class StageConfig(Schedule):
     """Every how many-th point of a cloud takes part in the diversity loss, in turns."""
     ramp: tuple[int, int]
     """Steps between which the diversity weight rises from 0 to beta: the image has to speak before the codes."""
-    select: Literal["cd", "fps_cd"]
-    """Validation figure by which the stage's best checkpoint is chosen."""
+    select: Literal["cd", "fps_cd", "cd_1"]
+    """Validation figure by which the stage's best checkpoint is chosen: of all views joined, of these thinned to the
+    size of one prediction, or of one view."""
     joined_diversity: bool = False
     """False: the diversity loss compares single-view clouds. True: the concatenated clouds of all views, as in
     the paper's "highly diverse" model."""
@@ -103,6 +111,8 @@ class StageConfig(Schedule):
     """Weight of the gradient penalty in the critic's loss."""
     real_pool: int = 0
     """Ground truth clouds of other shapes that the critic sees, for each shape of the batch, beside its own."""
+    weight_decay: float = 0.0
+    """Weight of |weights|^2 / 2 beside the loss; no part of the paper's own training."""
 
     @property
     def exact_alpha(self) -> float:
@@ -111,6 +121,8 @@ class StageConfig(Schedule):
 
     def lasting(self, steps: int) -> Self:
         """As `Schedule.lasting`; the ramp keeps its place in the stage."""
+        if self.steps == 0:
+            return self
         start, end = (round(at * steps / self.steps) for at in self.ramp)
         return dataclasses.replace(super().lasting(steps), ramp=(start, max(1, end)))
 
@@ -140,6 +152,9 @@ class InferenceConfig:
     """Weight of |code|^2 / 2 beside the loss: pulls codes back to the N(0, 1) they were drawn from."""
     keep_norm: bool = False
     """Rescale every code to its first length after each step, so that it stays as likely under N(0, 1)."""
+    scored: Literal["joined", "each"] = "joined"
+    """How predictions from several views are compared with the truth: as one cloud, or each by itself, of which the
+    mean is taken."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,6 +174,9 @@ class FitConfig:
     128."""
     variant: Variant = "standard"
     """The paper's main model, or its "highly diverse" one, whose predictions disagree the more without search."""
+    system: System = "ours"
+    """What is trained: the conditional generator as the paper has it, or one of the methods that it is compared with.
+    Their recipes: train/recipes.py; their losses: train/lessons.py."""
     ending: Ending = "points"
     """What the generator ends in: points (the released network), or a code of the auto-encoder, whose frozen
     decoder makes the points (the network of the paper's text)."""
@@ -211,9 +229,13 @@ class FitConfig:
 
     @property
     def phases(self) -> dict[str, PretrainConfig | StageConfig]:
-        """What is run, in order, by name; no auto-encoder is trained if none is needed or one is given."""
-        first = {"autoencoder": self.pretrain} if self.needs_autoencoder and not self.autoencoder else {}
-        return {**first, "stage1": self.stages[0], "stage2": self.stages[1]}
+        """What is run, in order, by name. A phase of no steps is left out, and so is the auto-encoder's if none is
+        needed or one is given."""
+        stage1, stage2 = self.stages
+        found = {"autoencoder": self.pretrain, "stage1": stage1, "stage2": stage2}
+        if not self.needs_autoencoder or self.autoencoder:
+            del found["autoencoder"]
+        return {name: phase for name, phase in found.items() if phase.steps}
 
 
 _FULL_STAGE1 = StageConfig(

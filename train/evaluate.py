@@ -22,13 +22,13 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from models import Generator
+from models import Generator, Predictor
 from train.batches import LoadedSplit
 from train.config import FitConfig
 from train.errors import UserError
@@ -121,7 +121,7 @@ def _check(seeds: Sequence[int], views: Sequence[int], limit: int | None) -> Non
 
 
 def _score(
-    model: Generator,
+    model: Predictor,
     test: LoadedSplit,
     config: FitConfig,
     *,
@@ -131,7 +131,7 @@ def _score(
 ) -> tuple[dict[int, Scores], dict[int, Scores]]:
     """Number of views -> scores of all seeds, with search and descent; and, if there are codes, without."""
     ways = [config.inference]
-    if not model.config.deterministic:
+    if _takes_codes(model):
         ways.append(dataclasses.replace(config.inference, groups=1, steps=0))
     tables: list[dict[int, Scores]] = [{} for _ in ways]
     # A descent over n views compares n (n - 1) pairs again and again: the bar counts work, not shapes.
@@ -156,7 +156,7 @@ def _score(
 
 
 def _network_figures(
-    model: Generator,
+    model: Predictor,
     test: LoadedSplit,
     found: dict[int, Scores],
     random_codes: dict[int, Scores],
@@ -185,9 +185,13 @@ def _network_figures(
             for n, scores in found.items()
             if "searched" in scores and n in random_codes
         },
-        "diversity": None if model.config.deterministic else _diversity(model, test, members, seeds=seeds),
+        "diversity": _diversity(model, test, members, seeds=seeds) if _takes_codes(model) else None,
         "sensitivity": {"image": moved.image, "code": moved.code},
     }
+
+
+def _takes_codes(model: Predictor) -> TypeGuard[Generator]:
+    return isinstance(model, Generator) and not model.config.deterministic
 
 
 def _agreement(found: Scores, random_codes: Scores) -> dict[str, float]:

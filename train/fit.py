@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from models import PROFILES
 from train.batches import LoadedSplit, load_split
 from train.checkpoint import best_weights, latest_checkpoint, load_autoencoder, save_checkpoint, save_weights
 from train.config import FitConfig, fit_config_from_json, to_json
@@ -27,6 +26,7 @@ from train.log import RunLog
 from train.parallel import World, gather
 from train.pictures import draw_predictions
 from train.state import Training
+from train.systems import image_size
 
 _HEALTH_IMAGES = 12
 # The number that records carry for a phase.
@@ -67,11 +67,10 @@ def fit(
     world = gather()
     progress = progress and world.writes
     _check_run_directory(out, config, resume=resume)
-    size = PROFILES[config.profile]
     read = functools.partial(
         load_split,
         data,
-        image_size=(size.image_height, size.image_width),
+        image_size=image_size(config),
         map_size=config.map_size,
         gt_pool=config.gt_pool,
         categories=config.categories,
@@ -180,6 +179,10 @@ def _health_images(val: LoadedSplit) -> Tensor:
 
 
 def _check_fits(config: FitConfig, train: LoadedSplit, world: World) -> None:
+    if not config.phases:
+        raise UserError("nothing to train: every phase has 0 steps")
+    if world.size > 1 and config.system == "lin":
+        raise UserError("--system lin cannot be shared by processes: its batch norms need the whole batch")
     wanted_views = max(stage.views for stage in config.stages)
     if train.views < wanted_views:
         raise UserError(

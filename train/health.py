@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import chamfer_distance
-from models import Generator
+from models import Generator, Predictor
 
 
 class Sensitivity(NamedTuple):
@@ -21,7 +21,8 @@ class Sensitivity(NamedTuple):
     Attributes:
         image: of different images at one code.
         code: of different codes at one image.
-        dead_share: share of the trunk's output channels that are zero on every image and at every place.
+        dead_share: share of the trunk's output channels that are zero on every image and at every place; 0 for other
+            methods' networks.
     """
 
     image: float
@@ -30,23 +31,28 @@ class Sensitivity(NamedTuple):
 
 
 @torch.no_grad()
-def sensitivity(model: Generator, images: Tensor, *, seed: int = 0) -> Sensitivity:
+def sensitivity(model: Predictor, images: Tensor, *, seed: int = 0) -> Sensitivity:
     """Measures how far predictions move with the image and with the code.
 
     Args:
-        model: a generator.
+        model: a generator, or another method's network.
         images: (B, 3, H, W) of B >= 2 different shapes, in [0, 1].
         seed: draws the two codes that are used.
     """
     if len(images) < 2:
         raise ValueError(f"sensitivity: needs at least 2 images, got {len(images)}")
     codes = torch.randn(2, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
-    features = model.encode(images)
-    clouds = model.decode(features, codes.expand(2, len(images), -1))
+    codes, dead_share = codes.expand(2, len(images), -1), 0.0
+    if isinstance(model, Generator):
+        features = model.encode(images)
+        clouds = model.decode(features, codes)
+        dead_share = (features.amax((0, 2, 3)) <= 0).float().mean().item()
+    else:
+        clouds = model(images, codes)
     return Sensitivity(
         image=_mean_cd100(clouds[0], clouds[0].roll(1, 0)),
         code=_mean_cd100(clouds[0], clouds[1]),
-        dead_share=(features.amax((0, 2, 3)) <= 0).float().mean().item(),
+        dead_share=dead_share,
     )
 
 

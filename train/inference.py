@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import consistency_loss
-from models import Generator
+from models import Generator, Predictor
 from train.config import InferenceConfig
 
 # Objects are worked on in groups that together predict about so many points: 16 objects in 24 views of the cpu
@@ -24,11 +24,11 @@ class Reconstruction(NamedTuple):
     """The joined prediction of V images for each of B shapes.
 
     Attributes:
-        points: (B, V*N, 3) the concatenated clouds, world frame.
+        points: (B, V*N, 3) the concatenated clouds, world frame; (B, N, 3) from a network that reads views together.
         codes: (B, V, code_dim) the codes that made them.
         history: (S + 1, B) consistency loss x100 before the first of S gradient steps and after each; the loss of a
             shape that has stopped stays what it was. (0, B) when there was nothing to agree on (one view) or nothing
-            to choose (a deterministic network).
+            to choose (a network without codes).
         kept: (B,) int64, the step whose codes are returned: a row of `history`, or 0 where that is empty.
     """
 
@@ -39,7 +39,7 @@ class Reconstruction(NamedTuple):
 
 
 def reconstruct(
-    model: Generator,
+    model: Predictor,
     images: Tensor,
     *,
     groups: int | None = None,
@@ -51,7 +51,8 @@ def reconstruct(
     """Searches groups of random codes, keeps each object's most consistent one, descends on its codes.
 
     Args:
-        model: a generator; its parameters are left alone.
+        model: a generator; its parameters are left alone. Another method's network, which takes no codes, is just
+            asked.
         images: (V, 3, H, W) of one object, or (B, V, 3, H, W) of B objects, in [0, 1] on white.
         groups: groups of V codes tried per object; 5 if neither this nor `settings` says otherwise.
         steps: plain gradient steps on the kept codes; 30 likewise.
@@ -110,10 +111,14 @@ def _prolong(history: Tensor, rows: int) -> Tensor:
 
 
 def _reconstruct(
-    model: Generator, images: Tensor, candidates: Tensor, settings: InferenceConfig
+    model: Predictor, images: Tensor, candidates: Tensor, settings: InferenceConfig
 ) -> Reconstruction:
     """(B, V, 3, H, W) images and (G, B, V, D) candidates, few enough for memory."""
     shapes, views = images.shape[:2]
+    if not isinstance(model, Generator):
+        points = model.answers(images).flatten(1, 2)
+        nothing = torch.zeros(0, shapes)
+        return Reconstruction(points, candidates[0], nothing, torch.zeros(shapes, dtype=torch.int64))
     with torch.no_grad():
         features = model.encode(images.flatten(0, 1)).unflatten(0, (shapes, views))
         if views == 1 or model.config.deterministic:

@@ -30,12 +30,14 @@ class Front(NamedTuple):
     """The front constraint, and how much it had to hold on to.
 
     Attributes:
-        loss: scalar.
+        loss: scalar, the mean of `each`.
+        each: (scenes, V), every view's own.
         matched_share: mean share of observed points that have a visible predicted point to match (at most 1).
         fallback_share: share of views in which no predicted point was visible and the whole cloud stood in.
     """
 
     loss: Tensor
+    each: Tensor
     matched_share: Tensor
     fallback_share: Tensor
 
@@ -81,15 +83,15 @@ def front_loss(scene: Scene, distance: Literal["emd", "chamfer"]) -> Front:
             a_lengths=sets.predicted_lengths,
             b_lengths=sets.observed_lengths,
         )
-        loss = 100 * (terms.a_to_b + terms.b_to_a).mean()
+        each = 100 * (terms.a_to_b + terms.b_to_a)
     else:
         transport = earth_mover_distance(
             sets.predicted, sets.observed, a_lengths=sets.predicted_lengths, b_lengths=sets.observed_lengths
         )
         same_area = (_PAPER_MAP_SIZE / scene.depth.shape[-1]) ** 2
-        loss = same_area * (transport.cost * _matched(sets)).mean()
+        each = same_area * transport.cost * _matched(sets)
     matched_share = (_matched(sets) / sets.observed_lengths.clamp(min=1)).mean()
-    return Front(loss, matched_share, sets.fallback.float().mean())
+    return Front(each.mean(), each, matched_share, sets.fallback.float().mean())
 
 
 def _matched(sets: FrontSets) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from models import Generator
+from models import Predictor
 from train.batches import LoadedSplit
 
 _SHAPES = 3
@@ -17,7 +17,7 @@ _PIXELS = 128
 
 
 @torch.no_grad()
-def draw_predictions(model: Generator, val: LoadedSplit, path: Path, *, seed: int) -> None:
+def draw_predictions(model: Predictor, val: LoadedSplit, path: Path, *, seed: int) -> None:
     """Draws a few shapes of a split: predictions of one image and several codes, all views joined, and the truth.
 
     The shapes and codes are the same at every call with the same seed.

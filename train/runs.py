@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from models import Generator
+from models import Predictor
 from train.batches import LoadedSplit, load_split
-from train.checkpoint import config_of, load_generator
+from train.checkpoint import config_of, load_predictor
 from train.config import FitConfig
 from train.errors import UserError
 
@@ -22,7 +22,7 @@ class OpenRun(NamedTuple):
     `folder` is None for the weights that come with the repository.
     """
 
-    model: Generator
+    model: Predictor
     config: FitConfig
     folder: Path | None
 
@@ -57,7 +57,7 @@ def open_run(run: Path) -> OpenRun:
         UserError: there is nothing of the kind, or it cannot be read.
     """
     if run != Path(PRETRAINED) or run.exists():
-        model = load_generator(run)
+        model = load_predictor(run)
         return OpenRun(model, config_of(run, model), run if run.is_dir() else run.parent)
     weights = _SHIPPED / "generator.safetensors"
     if not weights.exists():
@@ -66,5 +66,5 @@ def open_run(run: Path) -> OpenRun:
             "(python -m train data procedural --out data --shapes 400 --size 112, then python -m train fit "
             "--data data --out run, about an hour) and name that run instead"
         )
-    model = load_generator(weights)
+    model = load_predictor(weights)
     return OpenRun(model, config_of(_SHIPPED, model), None)

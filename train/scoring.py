@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import consistency_loss
-from models import Generator
+from models import Generator, Predictor
 from train.batches import LoadedSplit
 from train.config import InferenceConfig
 from train.inference import reconstruct
@@ -34,7 +34,7 @@ Scores = dict[str, Tensor]
 
 
 def score(
-    model: Generator,
+    model: Predictor,
     test: LoadedSplit,
     settings: InferenceConfig,
     *,
@@ -46,9 +46,10 @@ def score(
     """Reconstructs every shape of a split from `views` of its views and compares it with the truth.
 
     Args:
-        model: a generator.
+        model: a generator, or another method's network.
         test: the split.
-        settings: search and descent; one group and no steps are random codes.
+        settings: search and descent; one group and no steps are random codes. With `scored="each"` the figures are
+            means over the views' predictions, and "best_cd" is the best one's chamfer distance.
         views: how many views each shape shows; which ones, the seed decides, and fewer are the first of more.
         seed: draws views and codes.
         code_seed: draws the codes in place of `seed`.
@@ -65,22 +66,33 @@ def score(
         shapes = torch.arange(start, min(start + SHAPES_AT_ONCE, len(test)))
         images, truth = test.float_images(shapes, order[shapes, :views]), test.points[shapes]
         found = reconstruct(model, images, seed=draw * 10_000 + start, settings=settings)
-        scores = compare(found.points, truth, points=model.points)
+        each = _predictions(model, found.points, views)
+        if settings.scored == "each" and each is not None:
+            by_view = compare(each, truth[:, None].expand(-1, views, -1, -1), points=model.points)
+            scores = {name: values.mean(1) for name, values in by_view.items()}
+            scores["best_cd"] = by_view["cd"].amin(1)
+        else:
+            scores = compare(found.points, truth, points=model.points)
         scores["code_norm"] = found.codes.norm(dim=-1).mean(1)
         if len(found.history):
             scores["searched"] = found.history[0]
             scores["consistency"] = found.history.gather(0, found.kept[None])[0]
-        elif views > 1:
-            scores["consistency"] = 100 * consistency_loss(
-                found.points.unflatten(1, (views, model.points)), reduction="none"
-            )
+        elif views > 1 and each is not None:
+            scores["consistency"] = 100 * consistency_loss(each, reduction="none")
         parts.append(scores)
         done(len(shapes))
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
+def _predictions(model: Predictor, points: Tensor, views: int) -> Tensor | None:
+    """Every view's own cloud in a reconstruction (B, V*N, 3): (B, V, N, 3); None where views are read together."""
+    if not isinstance(model, Generator) and model.reads_views_together:
+        return None
+    return points.unflatten(1, (views, -1))
+
+
 def compare(predicted: Tensor, truth: Tensor, *, points: int) -> Scores:
-    """Clouds (B, N, 3) beside clouds (B, M, 3).
+    """Clouds (*B, N, 3) beside clouds (*B, M, 3).
 
     Args:
         predicted: the joined predictions.

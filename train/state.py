@@ -3,22 +3,20 @@ listens."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
-from models import PROFILES as SIZES
-from models import Critic, GeneratorConfig, build_autoencoder, build_generator
+from models import Critic, Generator, build_autoencoder
 from train.batches import Batch, LoadedSplit, Sampler
 from train.checkpoint import (
     best_weights,
     load_autoencoder,
-    load_generator,
     load_networks,
+    load_predictor,
     load_state,
     save_weights,
 )
@@ -26,8 +24,10 @@ from train.config import FitConfig, PretrainConfig, StageConfig
 from train.errors import UserError
 from train.health import sensitivity
 from train.laps import Laps
+from train.lessons import Given
 from train.parallel import ALONE, World
 from train.step import Chance, Learner, autoencoder_step, trainable, training_step
+from train.systems import METHODS, build_network, taught_step
 from train.validation import validate, validate_autoencoder
 
 _DEAF_CHECKS = 3
@@ -50,7 +50,7 @@ class Training:
         self._train, self._world = train, world
         self._sampler = Sampler(len(train), train.views, seed=config.seed)
         self._random = torch.Generator().manual_seed(config.seed)
-        generator = build_generator(config=size_of(config))
+        generator = cast(Generator, build_network(config))  # for the step of our own system; see `Learner`
         autoencoder = build_autoencoder(config.profile)
         critic = Critic()
         self.learner = Learner(generator, critic, autoencoder, _adam(autoencoder), _adam(critic))
@@ -74,8 +74,8 @@ class Training:
             self._take_autoencoder(run)
             if self.learner.generator.ends_in_latent:
                 self.learner.generator.adopt_decoder(self.learner.autoencoder)
-        if name == "stage2":
-            self.learner.generator.load_state_dict(load_generator(best_weights(run, 1)).state_dict())
+        if name == "stage2" and "stage1" in self.config.phases:
+            self.learner.generator.load_state_dict(load_predictor(best_weights(run, 1)).state_dict())
 
     def _take_autoencoder(self, run: Path) -> None:
         found = load_autoencoder(best_weights(run, "autoencoder"))
@@ -95,7 +95,10 @@ class Training:
             learner.autoencoder.train().requires_grad_(True)
         else:
             learner.autoencoder.freeze()
-        learner.optimiser = _adam(learner.autoencoder if pretraining else learner.generator)
+        if isinstance(self.phase, StageConfig):
+            learner.optimiser = _adam(learner.generator.train(), weight_decay=self.phase.weight_decay)
+        else:
+            learner.optimiser = _adam(learner.autoencoder)
 
     def advance(self) -> dict[str, Tensor]:
         """Draws a batch and makes one step of the current phase; returns scalars for the log."""
@@ -110,9 +113,14 @@ class Training:
         else:
             batch, chance = self._draw(phase)
             laps.stop("data")
-            report = training_step(
-                self.learner, batch, chance, phase, step=self.step, laps=laps, world=self._world
-            )
+            if batch.truth is None:
+                report = training_step(
+                    self.learner, batch, chance, phase, step=self.step, laps=laps, world=self._world
+                )
+            else:
+                given = Given(batch, batch.truth, chance.codes, phase, self.step)
+                lesson = METHODS[self.config.system].lessons[self.phase_name]
+                report = taught_step(self.learner, given, lesson, laps=laps, world=self._world)
         laps.end_step()
         self.step += 1
         self.total_steps += 1
@@ -145,6 +153,8 @@ class Training:
             mix = torch.rand(stage.n_critic, stage.codes, images, generator=self._random)
             real = [self._clouds(shapes), *(self._draw_clouds(stage.shapes) for _ in range(stage.real_pool))]
             batch = batch._replace(real=share(torch.stack(real), 1))
+        if self.config.system != "ours":
+            batch = batch._replace(truth=self._train.truth(share(shapes)))
         return batch, Chance(share(codes, 1), share(mix, -1))
 
     def networks(self) -> dict[str, nn.Module]:
@@ -225,13 +235,6 @@ class Training:
         return figures
 
 
-def size_of(config: FitConfig) -> GeneratorConfig:
-    """The generator that a configuration trains."""
-    return dataclasses.replace(
-        SIZES[config.profile], deterministic=config.deterministic, ending=config.ending
-    )
-
-
-def _adam(network: nn.Module) -> torch.optim.Adam:
+def _adam(network: nn.Module, *, weight_decay: float = 0.0) -> torch.optim.Adam:
     """Its step size is set at every step."""
-    return torch.optim.Adam(trainable(network), fused=True)
+    return torch.optim.Adam(trainable(network), fused=True, weight_decay=weight_decay)

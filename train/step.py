@@ -23,6 +23,7 @@ class Learner:
     """The networks, and what descends on them."""
 
     generator: Generator
+    """Or another method's network, which takes steps of its own (train/systems.py)."""
     critic: Critic
     autoencoder: Autoencoder
     """Frozen while the generator learns."""

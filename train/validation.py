@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from models import Autoencoder, Generator
+from models import Autoencoder, Generator, Predictor
 from train.batches import LoadedSplit
 from train.metrics import cloud_errors, thin_out
 from train.parallel import ALONE, World
@@ -13,9 +13,9 @@ _SHAPES_AT_ONCE = 8
 
 
 @torch.no_grad()
-def validate(model: Generator, split: LoadedSplit, *, seed: int, world: World = ALONE) -> dict[str, float]:
+def validate(model: Predictor, split: LoadedSplit, *, seed: int, world: World = ALONE) -> dict[str, float]:
     """Mean errors x100 over a split: one view (`val_cd_1`), all views joined (`val_cd`), and thinned
-    (`val_fps_cd`).
+    (`val_fps_cd`). Of another method's network all views are scored as it answers: together, or one by one.
 
     The codes are the same at every call, so that two checkpoints differ by their weights alone. A group of processes
     shares the shapes.
@@ -27,13 +27,19 @@ def validate(model: Generator, split: LoadedSplit, *, seed: int, world: World = 
     for shapes in torch.arange(world.rank, len(split), world.size).split(_SHAPES_AT_ONCE):
         views = torch.arange(split.views).expand(len(shapes), -1)
         images = split.float_images(shapes, views).flatten(0, 1)
-        clouds = model(images, codes[:, shapes].flatten(1, 2))[0].unflatten(0, views.shape)
-        joined, truth = clouds.flatten(1, 2), split.points[shapes]
+        if isinstance(model, Generator):
+            clouds = model(images, codes[:, shapes].flatten(1, 2))[0].unflatten(0, views.shape)
+            first, answers = clouds[:, :1].contiguous(), clouds.flatten(1, 2)[:, None]
+        else:
+            images = images.unflatten(0, views.shape)
+            first, answers = model.answers(images[:, :1]), model.answers(images)
+        truth = split.points[shapes][:, None]
+        each_truth = truth.expand(-1, answers.shape[1], -1, -1)
         sums += torch.stack(
             [
-                cloud_errors(clouds[:, 0].contiguous(), truth).cd.sum(),
-                cloud_errors(joined, truth).cd.sum(),
-                cloud_errors(thin_out(joined, model.points), truth).cd.sum(),
+                cloud_errors(first, truth).cd.sum(),
+                cloud_errors(answers, each_truth).cd.mean(1).sum(),
+                cloud_errors(thin_out(answers, model.points), each_truth).cd.mean(1).sum(),
             ]
         )
     means = (world.sum(sums) / len(split)).tolist()

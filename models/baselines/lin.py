@@ -32,15 +32,17 @@ class LinConfig(BaselineConfig):
         width: factor on all hidden channels; 1 is the paper's.
         map_size: side of the eight maps, 4 times a power of two.
         batch_momentum: how much a batch counts in the running statistics; less in longer trainings.
+        upsample: how many times larger than the true depth maps those of the pseudo-renderer are, in training.
     """
 
     width: float = 0.25
     map_size: int = 32
     batch_momentum: float = 0.02
+    upsample: int = 3
 
 
 LIN_PROFILES = {
-    "full": LinConfig("full", 64, 64, 2048, 1.0, 128, 0.001),
+    "full": LinConfig("full", 64, 64, 2048, 1.0, 128, 0.001, upsample=5),
     "cpu": LinConfig(),
     "smoke": LinConfig("smoke", 32, 32, 128, 0.125, 16, 0.1),
 }

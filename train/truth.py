@@ -1,0 +1,71 @@
+"""What the other methods are taught with, made from surface points and depth maps: cells, and fixed views."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from diffpoint import PinholeCamera, project, splat_depth
+from models.baselines import cell_centres, fixed_cameras
+from train.batches import Truth
+
+# World units: the gaps between the 2048 points of a surface are closed, and outlines grow by no more than this.
+_POINT_RADIUS = 0.01
+
+
+def solid_cells(truth: Truth, size: int) -> Tensor:
+    """Which cells of the cube [-0.5, 0.5]^3 a shape fills: (B, G, G, G) bool, along x, y and z.
+
+    A cell is empty when some view sees its centre lying before the surface or before nothing; the rest is filled, and
+    so is every cell that holds a point of the surface: thin parts miss the centres. What no view looks into counts
+    as filled.
+
+    Args:
+        truth: the shapes.
+        size: G.
+
+    Example:
+        >>> eyes = torch.tensor([[[0.0, 0, -2], [0, 0, 2], [2, 0, 0], [-2, 0, 0]]])
+        >>> camera = PinholeCamera.look_at(eyes, focal_px=40.0, height=32, width=32)
+        >>> cube = torch.cartesian_prod(*[torch.linspace(-0.24, 0.24, 40)] * 3)[None]
+        >>> cells = solid_cells(Truth(cube, splat_depth(cube, camera).depth, camera), 8)
+        >>> cells[0, :, 4, 4].int().tolist()
+        [0, 0, 1, 1, 1, 1, 0, 0]
+    """
+    batch, _, height, width = truth.depth.shape
+    centres = cell_centres(size).to(truth.points)
+    pixels, depth = project(centres.expand(batch, -1, -1), truth.camera)
+    x, y = pixels.floor().long().unbind(-1)
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (depth > 0)
+    place = torch.where(inside, y * width + x, 0)
+    surface = truth.depth.flatten(2).gather(2, place)
+    filled = ~(inside & (depth < surface)).any(1)
+    cell = ((truth.points + 0.5) * size).floor().long()
+    held = ((cell >= 0) & (cell < size)).all(-1)
+    x, y, z = cell.unbind(-1)
+    number = torch.where(held, (x * size + y) * size + z, size**3)  # beyond the grid: a cell that is cut off
+    holds_point = torch.zeros(batch, size**3 + 1, dtype=torch.bool).scatter_(1, number, True)[:, :-1]
+    return (filled | holds_point).unflatten(1, (size, size, size))
+
+
+def fixed_depth(points: Tensor, size: int) -> Tensor:
+    """Depth maps of surfaces before the eight fixed orthographic cameras of Lin et al.
+
+    Args:
+        points: (B, P, 3) on the surface, world frame.
+        size: side of the maps, which cover one unit of the world.
+
+    Returns:
+        (B, 8, size, size), +inf where empty.
+
+    Example:
+        >>> fixed_depth(torch.zeros(1, 1, 3), 4)[0, 0].isfinite().sum().item()
+        1
+    """
+    seen = fixed_cameras(points).flatten(0, 1)
+    # A pinhole camera divides by the depth: multiplied by it before, points keep their place across.
+    stretched = torch.cat([seen[..., :2] * seen[..., 2:], seen[..., 2:]], -1)
+    K = torch.tensor([[size, 0.0, size / 2], [0.0, size, size / 2], [0.0, 0.0, 1.0]])
+    camera = PinholeCamera(K.to(points), torch.eye(4).to(points), size, size)
+    depth = splat_depth(stretched.contiguous(), camera, radius=_POINT_RADIUS * size).depth
+    return depth.reshape(len(points), -1, size, size)
