@@ -7,7 +7,7 @@ from PIL import Image
 from train.__main__ import main
 from train.data import ShapeTree, store
 from train.data.procedural import generate
-from train.data.show import row_of, show
+from train.data.show import _arranged, show, strip_of
 from train.errors import UserError
 
 
@@ -22,23 +22,46 @@ def test_a_sheet_for_each_category(data, tmp_path):
     sheets = show(data, tmp_path / "sheets", shapes=2)
     assert sheets == {name: tmp_path / "sheets" / f"{name}.png" for name in ("lamp", "car")}
     tall, wide, _ = np.asarray(Image.open(sheets["lamp"])).shape
-    assert (tall, wide) == (2 * 128, 7 * 130)
+    assert (tall, wide) == (2 * (18 + 144), 7 * 144)
     only = show(data, tmp_path / "one", categories=["car"], shapes=50)
     assert list(only) == ["car"]
-    assert np.asarray(Image.open(only["car"])).shape[0] == 3 * 128
+    assert np.asarray(Image.open(only["car"])).shape[0] == 3 * (18 + 144)
 
 
 def test_each_cell_shows_the_object_on_white(data):
-    strip = row_of(ShapeTree(data, "train")[0])
-    cells = strip.reshape(128, 7, 130, 3).transpose(1, 0, 2, 3)
+    strip = strip_of(ShapeTree(data, "train")[0], split="train")
+    title, cells = strip[:18], strip[18:].reshape(144, 7, 144, 3).transpose(1, 0, 2, 3)
+    assert 0.005 < (title < 200).any(-1).mean() < 0.2
     for cell in cells:
         assert 0.01 < (cell < 250).any(-1).mean() < 0.6
-        assert (cell[:3] == 255).all()
+        assert (cell[:3] > 250).all()
     ink = [(cell < 250).any(-1) for cell in cells]
-    same = (ink[0] & ink[5]).sum() / (ink[0] | ink[5]).sum()  # the first view, and the cloud from there
-    other = (ink[0] & ink[6]).sum() / (ink[0] | ink[6]).sum()
-    assert same > 0.75
-    assert same > other
+    views, depth, cloud, behind = ink[:4], *ink[4:]
+    assert _overlap(views[0], depth) > 0.9
+    assert _overlap(views[0], cloud) > 0.75
+    assert _overlap(views[0], cloud) > _overlap(views[0], behind)
+    assert len(np.unique(cells[4][depth].reshape(-1, 3), axis=0)) > 100  # many depths, many colours
+
+
+def _overlap(one, other):
+    return (one & other).sum() / (one | other).sum()
+
+
+def test_the_object_fills_its_cells(data):
+    strip = strip_of(ShapeTree(data, "train")[0], split="train")
+    cells = strip[18:].reshape(144, 7, 144, 3).transpose(1, 0, 2, 3)
+    reach = max(abs(np.argwhere((cell < 250).any(-1)) - 71.5).max() for cell in cells)
+    assert 55 < reach < 72
+
+
+def test_many_shapes_stand_in_columns():
+    strips = [np.full((2, 10, 3), k, np.uint8) for k in range(40)]
+    sheet = _arranged(strips)
+    assert sheet.shape == (20 * 2, 10 + 16 + 10, 3)
+    assert sheet[::2, 0, 0].tolist() == list(range(20))
+    assert sheet[::2, -1, 0].tolist() == list(range(20, 40))
+    assert _arranged(strips[:16]).shape == (32, 10, 3)
+    assert (_arranged(strips[:39])[-1, -1] == 255).all()
 
 
 def test_broken_shapes_are_left_out_and_mistakes_named(data, tmp_path, capsys):
@@ -52,7 +75,7 @@ def test_broken_shapes_are_left_out_and_mistakes_named(data, tmp_path, capsys):
     (folders[0] / "depth_0.png").write_bytes(b"no")
     assert main(["data", "show", str(root)]) == 0
     assert "lamp: " in capsys.readouterr().out
-    assert np.asarray(Image.open(root / "contact" / "lamp.png")).shape[0] == 128
+    assert np.asarray(Image.open(root / "contact" / "lamp.png")).shape[0] == 18 + 144
     assert main(["data", "check", str(root)]) == 1
     (folders[1] / "depth_0.png").write_bytes(b"no")
     with pytest.raises(UserError, match="no shape of lamp can be read"):

@@ -117,7 +117,7 @@ class Show:
     categories: tuple[str, ...] = ()
     """Categories to draw; none means all."""
     shapes: int = 8
-    """Rows of a sheet."""
+    """Shapes on a sheet, evenly spread over the category."""
 
     def run(self) -> None:
         from train.data.show import show

@@ -1,4 +1,4 @@
-"""Contact sheets of a dataset: for each category a picture with a row for each shape, to be looked at."""
+"""Contact sheets of a dataset: for each category a picture with a strip for each shape, to be looked at."""
 
 from __future__ import annotations
 
@@ -7,21 +7,29 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from matplotlib import colormaps
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
+from tqdm import tqdm
 
 from diffpoint import PinholeCamera, project
 from train.data import store
 from train.data.categories import category_of, synset_of
 from train.data.tree import Shape, ShapeError, ShapeTree, read_shape
 from train.errors import UserError
-from train.figures import TRUE, from_behind
+from train.figures import TRUE, close_up, from_behind
 from train.files import replacing
 
-_CELL = 128
+_CELL = 144
 _VIEWS = 4
-_GAP = 2
+_COLUMNS = _VIEWS + 3
+_TITLE = 18  # pixels of the line above a strip
+_RULE = 16  # pixels between strips that stand side by side
+_TALLEST = 16  # strips above each other, before there are two columns of them
+_FINER = 3  # clouds are drawn so many times larger, and shrunk
+_RADIUS = 1.2  # pixels
+_INK = (90, 100, 112)
 
 
 def show(
@@ -29,11 +37,13 @@ def show(
 ) -> dict[str, Path]:
     """Write a contact sheet for each category, named after it: views, depth, the cloud from that view and from behind.
 
+    Every strip is titled with its shape's name and split, so that what is wrong can be found.
+
     Args:
         data: root of a data tree.
         out: folder of the sheets; `contact/` in the data tree if not given.
         categories: names or synsets; None for all.
-        shapes: rows of a sheet, evenly spread over the category's shapes.
+        shapes: strips of a sheet, evenly spread over the category's shapes.
 
     Returns:
         The sheets by category.
@@ -44,9 +54,11 @@ def show(
     if shapes < 1:
         raise UserError(f"shapes must be at least 1; got {shapes}")
     ids: dict[str, list[str]] = defaultdict(list)
+    split_of: dict[str, str] = {}
     for split in store.SPLITS:
         for shape in ShapeTree(data, split).ids:
             ids[shape.split("/")[0]].append(shape)
+            split_of[shape] = split
     wanted = sorted(ids) if categories is None else [synset_of(name) for name in categories]
     absent = [category_of(synset) for synset in wanted if synset not in ids]
     if absent:
@@ -55,35 +67,62 @@ def show(
     sheets = {}
     for synset in wanted:
         found = sorted(ids[synset])
-        rows = []
-        for number in np.linspace(0, len(found) - 1, min(shapes, len(found))).astype(int):
+        strips = []
+        chosen = np.linspace(0, len(found) - 1, min(shapes, len(found))).astype(int)
+        for number in tqdm(chosen, desc=f"drawing {category_of(synset)}", unit="shape", leave=False):
             try:
-                rows.append(row_of(read_shape(data, found[number])))
+                strips.append(strip_of(read_shape(data, found[number]), split=split_of[found[number]]))
             except ShapeError:
                 continue  # `data check` names what is broken
-        if not rows:
+        if not strips:
             raise UserError(
                 f"{data}: no shape of {category_of(synset)} can be read; see: python -m train data check"
             )
         path = (out or data / "contact") / f"{category_of(synset)}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary:
-            Image.fromarray(np.concatenate(rows)).save(temporary, format="PNG", optimize=True)
+            Image.fromarray(_arranged(strips)).save(temporary, format="PNG", optimize=True)
         sheets[category_of(synset)] = path
     return sheets
 
 
-def row_of(shape: Shape) -> np.ndarray:
-    """One shape as a strip (cell, columns, 3) uint8: some views, then depth and cloud of the first of them."""
-    chosen = np.linspace(0, len(shape.images), _VIEWS, endpoint=False).astype(int)
+def strip_of(shape: Shape, *, split: str) -> np.ndarray:
+    """One shape as (title + cell, columns, 3) uint8: views; depth and cloud of the first; the cloud from behind."""
+    channels = torch.cat((shape.images, shape.depth[:, None]), dim=1)
+    channels, cameras = close_up(channels, shape.camera, shape.points)
+    chosen = np.linspace(0, len(channels), _VIEWS, endpoint=False).astype(int).tolist()
     cells = [
-        _resized((shape.images[view].permute(1, 2, 0).numpy() * 255).astype(np.uint8)) for view in chosen
+        _resized((channels[view, :3].permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8))
+        for view in chosen
     ]
-    camera = shape.camera[int(chosen[0])]
-    cells.append(_resized(_depth_picture(shape.depth[chosen[0]].numpy())))
+    cells.append(_resized(_depth_picture(channels[chosen[0], 3].numpy())))
+    camera = cameras[chosen[0]]
     cells += [_cloud_picture(shape.points, each) for each in (camera, from_behind(camera))]
-    gap = np.full((_CELL, _GAP, 3), 255, np.uint8)
-    return np.concatenate([part for cell in cells for part in (cell, gap)], axis=1)
+    title = f"{shape.id.split('/')[-1]}  ({split}, {len(shape.images)} views, {len(shape.points)} points)"
+    return np.concatenate((_title(title), np.concatenate(cells, axis=1)))
+
+
+def _title(text: str) -> np.ndarray:
+    line = Image.new("RGB", (_COLUMNS * _CELL, _TITLE), "white")
+    draw = ImageDraw.Draw(line)
+    draw.line((0, 0, line.width, 0), fill=(222, 226, 230))
+    draw.text((4, 3), text, fill=_INK, font=ImageFont.load_default())
+    return np.asarray(line)
+
+
+def _arranged(strips: Sequence[np.ndarray]) -> np.ndarray:
+    """Strips above each other, in so many columns that the sheet does not become a ribbon."""
+    columns = 1
+    while -(-len(strips) // columns) > _TALLEST * columns:
+        columns += 1
+    height = -(-len(strips) // columns)
+    blank = np.full_like(strips[0], 255)
+    padded = [*strips, *[blank] * (columns * height - len(strips))]
+    rule = np.full((height * len(blank), _RULE, 3), 255, np.uint8)
+    parts = [
+        part for k in range(columns) for part in (rule, np.concatenate(padded[k * height : (k + 1) * height]))
+    ]
+    return np.concatenate(parts[1:], axis=1)
 
 
 def _resized(picture: np.ndarray) -> np.ndarray:
@@ -104,12 +143,13 @@ def _depth_picture(depth: np.ndarray) -> np.ndarray:
 def _cloud_picture(points: Tensor, camera: PinholeCamera) -> np.ndarray:
     """Points (N, 3) as discs, far ones first; near ones are dark."""
     projected = project(points[None], camera)
-    pixels = projected.pixels[0, 0].numpy() * (_CELL / camera.width)
+    pixels = projected.pixels[0, 0].numpy() * (_FINER * _CELL / camera.width)
     depth = projected.depth[0, 0].numpy()
-    picture = Image.new("RGB", (_CELL, _CELL), "white")
+    picture = Image.new("RGB", (_FINER * _CELL, _FINER * _CELL), "white")
     draw = ImageDraw.Draw(picture)
     tones = (np.asarray(TRUE((depth - depth.min()) / max(np.ptp(depth), 1e-6)))[:, :3] * 255).astype(int)
+    radius = _FINER * _RADIUS
     for point in np.argsort(-depth):
         (x, y), colour = pixels[point], tuple(tones[point].tolist())
-        draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=colour)
-    return np.asarray(picture)
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour)
+    return _resized(np.asarray(picture))
