@@ -22,7 +22,7 @@ from train import state as state_module
 from train.__main__ import main
 from train.batches import load_split
 from train.checkpoint import latest_checkpoint, load_generator
-from train.config import PROFILES, fit_config_from_json
+from train.config import PROFILES, Precision, fit_config_from_json
 from train.errors import UserError
 from train.fit import fit
 from train.log import read_metrics
@@ -259,12 +259,14 @@ def test_a_training_that_explodes_says_so(tiny_data: Path, tmp_path: Path) -> No
         fit(tiny_data, tmp_path / "run", dataclasses.replace(_SMOKE, stage1=stage), progress=False)
 
 
-def test_one_shape_can_be_learnt_by_heart(tiny_data: Path) -> None:
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_one_shape_can_be_learnt_by_heart(precision: Precision, tiny_data: Path) -> None:
     """One shape, four joined views, 300 steps, without a critic: the front loss falls below 40 % of its start."""
     split = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, limit=1, progress=False)
     stage = dataclasses.replace(
         _SMOKE.stage2, steps=300, shapes=1, views=4, codes=2, gamma=0.0, learning_rate=1e-3
     )
-    training = Training(dataclasses.replace(_SMOKE, stage1=stage, stage2=stage), split)
+    config = dataclasses.replace(_SMOKE, stage1=stage, stage2=stage, precision=precision)
+    training = Training(config, split)
     fronts = [training.advance()["front"].item() for _ in range(stage.steps)]
     assert sum(fronts[-10:]) / 10 < 0.4 * fronts[0]

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Profile = Literal["full", "cpu", "smoke"]
 Variant = Literal["standard", "highly-diverse"]
 Ending = Literal["points", "latent"]
+Precision = Literal["float32", "bfloat16"]
 System = Literal["ours", "psgn", "psgn-mon", "front-mon", "lin", "r2n2", "ptn"]
 
 # The paper's alpha multiplies the released code's approximate EMD: a sum over 2048 points, about 1.3 times
@@ -180,6 +181,9 @@ class FitConfig:
     ending: Ending = "points"
     """What the generator ends in: points (the released network), or a code of the auto-encoder, whose frozen
     decoder makes the points (the network of the paper's text)."""
+    precision: Precision = "float32"
+    """In what the generator computes while it learns. bfloat16: all layers but the last, about twice as fast where the
+    processor can multiply such numbers (avx512_bf16, amx; see lscpu), slower elsewhere."""
     autoencoder: str | None = None
     """A run, or a .safetensors file of one, whose auto-encoder is used instead of training one."""
     categories: tuple[str, ...] = ()

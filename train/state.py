@@ -51,6 +51,7 @@ class Training:
         self._sampler = Sampler(len(train), train.views, seed=config.seed)
         self._random = torch.Generator().manual_seed(config.seed)
         generator = cast(Generator, build_network(config))  # for the step of our own system; see `Learner`
+        generator.computes_in = getattr(torch, config.precision)
         autoencoder = build_autoencoder(config.profile)
         critic = Critic()
         self.learner = Learner(generator, critic, autoencoder, _adam(autoencoder), _adam(critic))

@@ -100,6 +100,8 @@ def _check(config: FitConfig) -> None:
             f"--system {config.system} knows no critic, latent ending, deterministic counterpart or variant; "
             "leave --ending, --deterministic, --variant and the stages' gamma as they are"
         )
+    if config.precision != "float32":
+        raise UserError(f"--system {config.system} computes in float32; leave --precision as it is")
     if missing := set(config.phases) - set(METHODS[config.system].lessons):
         raise UserError(f"--system {config.system} has no {', '.join(sorted(missing))}; leave its steps at 0")
 
