@@ -15,8 +15,9 @@ from train.checkpoint import best_weights
 from train.errors import UserError
 from train.experiments import Workbench, run_experiment
 from train.experiments.health import VARIANTS
-from train.experiments.paper import DETERMINISTIC, TABLES, deterministic
+from train.experiments.paper import DETERMINISTIC, TABLES, deterministic, with_critic
 from train.experiments.table import Expectation, Row, Table, confidence, make
+from train.log import read_metrics
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +148,18 @@ def test_what_health_undoes_is_undone() -> None:
     before = first.weight.std()
     initialise(model)
     assert first.weight.std() < 0.8 * before
+
+
+def test_the_critic_s_opinion_is_that_of_the_log(bench: Workbench) -> None:
+    bench = dataclasses.replace(bench, seeds=1)
+    result = run_experiment("critic", bench)
+    assert set(result["rows"]) == {row.name for row in TABLES["critic"].rows}
+    run = bench.run_of(bench.config(with_critic, seed=0))
+    scores = [record["fake_score"] for record in read_metrics(run) if "fake_score" in record]
+    assert sum(result["opinion"][0]["fake"]) / len(result["opinion"][0]["fake"]) == pytest.approx(
+        sum(scores) / len(scores), rel=0.2
+    )
+    assert (bench.out / "critic-scores.png").stat().st_size > 10_000
 
 
 def test_wrong_requests_are_named(bench: Workbench, tmp_path: Path) -> None:

@@ -264,14 +264,18 @@ def _curves(axes: Axes, records: Sequence[dict[str, Any]], names: dict[str, str]
             axes.plot(steps, values, ".-", color=colour, label=label, lw=1.2)
             continue
         axes.plot(steps, values, color=colour, alpha=0.25, lw=0.8)
-        kernel = np.ones(window)
-        mean = np.convolve(values, kernel, "same") / np.convolve(np.ones_like(values), kernel, "same")
-        axes.plot(steps, mean, color=colour, label=label, lw=1.6)
+        axes.plot(steps, running_mean(values, share=25), color=colour, label=label, lw=1.6)
     if len(names) > 1 and axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=9)
     axes.set_xlabel("step")
     axes.title.set_fontsize(11)
     _plain(axes)
+
+
+def running_mean(values: np.ndarray, *, share: int) -> np.ndarray:
+    """The mean over a window of one part in `share` of all values; shorter at the ends."""
+    kernel = np.ones(max(1, len(values) // share))
+    return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
 
 
 def _plain(axes: Axes) -> None:

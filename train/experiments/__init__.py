@@ -8,6 +8,7 @@ from typing import Any
 
 from train.errors import UserError
 from train.experiments.agreement import agreement
+from train.experiments.critic import critic
 from train.experiments.health import health
 from train.experiments.paper import TABLES
 from train.experiments.table import make
@@ -27,6 +28,7 @@ def _about_a_run(bench: Workbench, run: Path | None, views: int) -> dict[str, An
 
 _TRAINING: dict[str, Callable[[Workbench], dict[str, Any]]] = {"health": health}
 _TRAINING |= {name: lambda bench, table=table: make(table, bench) for name, table in TABLES.items()}
+_TRAINING["critic"] = critic
 
 EXPERIMENTS = ("agreement", *_TRAINING)
 """Names of all experiments."""
