@@ -17,11 +17,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from diffpoint.io import read_points, write_points
 from train.batches import LoadedSplit, Sampler, load_split
 from train.data import ShapeTree, store
 from train.data.cache import prepare
 from train.data.shrink import Sizes, SmallShape, shrink
-from train.data.tree import read_shape
+from train.data.tree import _found_frame, read_shape
 
 SIZES = Sizes((48, 64), 16)
 REPOSITORY = Path(__file__).parents[1]
@@ -130,7 +131,7 @@ def test_a_changed_shape_is_read_again(
     after = _prepare(tree)
     assert _same(after, _fresh(tree))
     assert not _same({victim: after[victim]}, {victim: before[victim]})
-    assert "1 prepared shape is outdated; made again" in capsys.readouterr().err
+    assert capsys.readouterr().err.count("1 prepared shape is outdated; made again") == 1
     again = _files(tree)
     assert [name for name in made if again[name] != made[name]] == [victim.split("/")[1]]
 
@@ -166,7 +167,7 @@ def test_a_damaged_file_is_made_again(
     victim = min((tree / ".prepared").rglob("*.safetensors"))
     damage(victim)
     assert _same(_prepare(tree), _fresh(tree))
-    assert "1 prepared shape is damaged; made again" in capsys.readouterr().err
+    assert capsys.readouterr().err.count("1 prepared shape is damaged; made again") == 1
     assert _same(_prepare(tree), _fresh(tree))
     assert capsys.readouterr().err == ""
 
@@ -182,6 +183,38 @@ def test_a_tree_that_cannot_be_written_to_is_prepared_elsewhere(
     assert _same(_prepare(tree), _fresh(tree))
     assert _files(tmp_path / "cache") == made
     assert capsys.readouterr().err == ""
+
+
+def test_old_files_in_a_tree_that_cannot_be_written_to_are_passed_over(
+    tree: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _prepare(tree)
+    _repaint(tree, ShapeTree(tree, "train").ids[0])
+    files = next((tree / ".prepared").iterdir())
+    shutil.move(files, tmp_path / "aside")
+    files.write_text("in the way, so that the user's own folder is taken")
+    _prepare(tree)
+    files.unlink()
+    shutil.move(tmp_path / "aside", files)
+    capsys.readouterr()
+    assert _same(_prepare(tree), _fresh(tree))
+    assert capsys.readouterr().err == ""
+
+
+def test_a_turned_tree_is_read_again(tree: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A tree from elsewhere, whose clouds turn out to be in another frame than was thought."""
+    (tree / "made_with.json").unlink()
+    before = _prepare(tree)
+    for file in (tree / store.CLOUDS).rglob("*.ply"):
+        status = file.stat()
+        points = read_points(file)
+        write_points(file, points[:, [0, 2, 1]] * torch.tensor([1.0, -1.0, 1.0]))  # z up
+        os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
+    _found_frame.cache_clear()
+    after = _prepare(tree)
+    assert _same(after, _fresh(tree))
+    assert all(torch.allclose(after[name].points, before[name].points, atol=1e-6) for name in before)
+    assert f"{len(before)} prepared shapes are outdated" in capsys.readouterr().err
 
 
 def test_without_any_place_shapes_are_read_into_memory(

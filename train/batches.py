@@ -158,7 +158,9 @@ def load_split(
     sizes = Sizes(image_size, map_size, gt_pool)
     shapes: list[SmallShape] = []
     for tree in trees:
-        for name, small in prepare(tree.path, tree.ids, sizes, name=split, progress=progress).items():
+        prepared = prepare(tree.path, tree.ids, sizes, name=split, progress=progress)
+        for name in tree.ids:
+            small = prepared[name]
             if isinstance(small, SmallShape):
                 shapes.append(small)
             else:

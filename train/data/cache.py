@@ -22,16 +22,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 from tqdm import tqdm
 
-from train.data import store
 from train.data.categories import category_of
+from train.data.frames import Frame
 from train.data.shrink import Sizes, SmallShape, shrink
-from train.data.tree import ShapeError, read_shape
+from train.data.tree import ShapeError, frame_of, layout_of, read_shape
 from train.data.work import run_all
 from train.errors import UserError
 from train.files import replacing
@@ -63,18 +64,53 @@ def prepare(
     Raises:
         UserError: `sizes` do not fit the renders.
     """
+    tree = _Tree(root, sizes, _name(frame_of(root)))
     places = _places(root, sizes)
-    found = _look_up(places, root, shapes, name=name, progress=progress)
+    found = _look_up(places, tree, shapes, name=name, progress=progress)
     missing = [shape for shape in shapes if shape not in found]
     if missing:
         place = _first_writable(places, root)
         if place is not None:
             with _one_at_a_time(place):
-                found |= _look_up(places, root, missing, progress=False)  # another process may have made them
+                # Another process may have made them while this one waited.
+                found |= {shape: small for shape in missing if (small := _find(places, tree, shape)[0])}
                 missing = [shape for shape in missing if shape not in found]
-                found |= _make(place, root, missing, sizes, name=name, progress=progress)
-        found |= _read(root, [shape for shape in missing if shape not in found], sizes, name, progress)
+                found |= _make(place, tree, missing, name=name, progress=progress)
+        found |= _read(tree, [shape for shape in missing if shape not in found], name=name, progress=progress)
     return {shape: found[shape] for shape in shapes}
+
+
+class _Tree(NamedTuple):
+    """A data tree, and what decides what is made of its files."""
+
+    root: Path
+    sizes: Sizes
+    frame: str
+
+    def source(self, shape: str) -> str:
+        """Changes when a file of the shape changes, appears or goes, or when the tree is turned another way."""
+        layout = layout_of(self.root)
+        cloud = layout.cloud_file(shape)
+        try:
+            with os.scandir(layout.folder(shape)) as entries:
+                lines = sorted(_line(entry.name, entry.stat()) for entry in entries)
+            lines.append(_line(cloud.name, cloud.stat()))
+        except OSError as error:
+            lines = [str(error)]  # reading the shape will say more
+        return hashlib.sha256("\n".join([self.frame, *lines]).encode()).hexdigest()[:32]
+
+    def read(self, shape: str) -> SmallShape:
+        """From its pictures."""
+        return shrink(read_shape(self.root, shape), self.sizes)
+
+
+def _name(frame: Frame) -> str:
+    turns = (frame.turn_cloud, frame.turn_world, frame.turn_camera)
+    return " ".join(repr(np.asarray(turn, float).tolist()) for turn in turns)
+
+
+def _line(name: str, stat: os.stat_result) -> str:
+    return f"{name} {stat.st_size} {stat.st_mtime_ns}"
 
 
 def _places(root: Path, sizes: Sizes) -> list[Path]:
@@ -126,25 +162,32 @@ def _one_at_a_time(place: Path) -> Iterator[None]:
 
 
 def _look_up(
-    places: Sequence[Path], root: Path, shapes: Sequence[str], *, name: str = "", progress: bool
+    places: Sequence[Path], tree: _Tree, shapes: Sequence[str], *, name: str, progress: bool
 ) -> dict[str, SmallShape | ShapeError]:
     """What is there already; files that cannot be used are counted and said."""
     found: dict[str, SmallShape | ShapeError] = {}
     unusable: Counter[str] = Counter()
     for shape in tqdm(shapes, desc=f"opening {name}", unit="shape", leave=False, disable=not progress):
-        source = _source(root, shape)
-        for place in places:
-            result = _open(place, shape, source)
-            if isinstance(result, SmallShape):
-                found[shape] = result
-                break
-            unusable[result] += result != ""
+        small, reason = _find(places, tree, shape)
+        if small is not None:
+            found[shape] = small
+        elif reason:
+            unusable[reason] += 1
     for reason, count in sorted(unusable.items()):
-        if count:
-            _say(
-                f"{root}: {count} prepared {'shape is' if count == 1 else 'shapes are'} {reason}; made again"
-            )
+        what = "shape is" if count == 1 else "shapes are"
+        _say(f"{tree.root}: {count} prepared {what} {reason}; made again")
     return found
+
+
+def _find(places: Sequence[Path], tree: _Tree, shape: str) -> tuple[SmallShape | None, str]:
+    """A prepared shape, from the first place that has it; else what is the matter with its file, if there is one."""
+    source, reason = tree.source(shape), ""
+    for place in places:
+        result = _open(place, shape, source)
+        if isinstance(result, SmallShape):
+            return result, ""
+        reason = reason or result
+    return None, reason
 
 
 def _open(place: Path, shape: str, source: str) -> SmallShape | str:
@@ -177,37 +220,19 @@ def _checksum(tensors: Mapping[str, Tensor]) -> str:
     return f"{value:08x}"
 
 
-def _source(root: Path, shape: str) -> str:
-    """Changes when a file of the shape changes, appears or goes."""
-    files = [store.cloud_file(root, shape)]
-    lines = []
-    try:
-        with os.scandir(store.render_folder(root, shape)) as entries:
-            lines = sorted(_line(entry.name, entry.stat()) for entry in entries)
-        lines += [_line(file.name, file.stat()) for file in files]
-    except OSError as error:
-        lines.append(str(error))  # reading the shape will say more
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:32]
-
-
-def _line(name: str, stat: os.stat_result) -> str:
-    return f"{name} {stat.st_size} {stat.st_mtime_ns}"
-
-
 class _Job(NamedTuple):
     place: Path
-    root: Path
+    tree: _Tree
     shape: str
-    sizes: Sizes
 
 
 def _make(
-    place: Path, root: Path, shapes: Sequence[str], sizes: Sizes, *, name: str, progress: bool
+    place: Path, tree: _Tree, shapes: Sequence[str], *, name: str, progress: bool
 ) -> dict[str, SmallShape | ShapeError]:
     """Makes the files of `shapes`, those for which there is room, and maps them."""
     for leftover in place.glob("*/.*.tmp"):  # of a process that was killed
         leftover.unlink(missing_ok=True)
-    jobs = [_Job(place, root, shape, sizes) for shape in shapes]
+    jobs = [_Job(place, tree, shape) for shape in shapes]
     processes = max(1, min(os.cpu_count() or 1, len(jobs) // _SHAPES_WORTH_A_PROCESS))
     made: dict[str, SmallShape | ShapeError] = {}
     results = run_all(
@@ -218,14 +243,14 @@ def _make(
             if isinstance(result, ShapeError):
                 made[job.shape] = result
             elif isinstance(result, UserError):
-                raise UserError(f"{root}: {result}")
+                raise UserError(f"{tree.root}: {result}")
             elif isinstance(result, OSError):  # its process died
                 made[job.shape] = ShapeError(f"{job.shape}: {result}")
             elif isinstance(result, _NoRoom):
                 _say(f"prepared shapes cannot be kept in {place} ({result.reason}); see {_PLACE}")
                 break
     for shape in shapes:
-        if shape not in made and isinstance(opened := _open(place, shape, _source(root, shape)), SmallShape):
+        if shape not in made and isinstance(opened := _open(place, shape, tree.source(shape)), SmallShape):
             made[shape] = opened
     return made
 
@@ -241,8 +266,8 @@ def _make_one(job: _Job) -> UserError | _NoRoom | None:
     if multiprocessing.parent_process() is not None:
         torch.set_num_threads(1)
     try:
-        source = _source(job.root, job.shape)  # before reading: what changes while it is read must not pass
-        small = shrink(read_shape(job.root, job.shape), job.sizes)
+        source = job.tree.source(job.shape)  # before reading: what changes while it is read must not pass
+        small = job.tree.read(job.shape)
         tensors = {name: getattr(small, name).contiguous() for name in _TENSORS}
         about = {"source": source, "checksum": _checksum(tensors)}
         with replacing(_file(job.place, job.shape)) as temporary:
@@ -255,17 +280,17 @@ def _make_one(job: _Job) -> UserError | _NoRoom | None:
 
 
 def _read(
-    root: Path, shapes: Sequence[str], sizes: Sizes, name: str, progress: bool
+    tree: _Tree, shapes: Sequence[str], *, name: str, progress: bool
 ) -> dict[str, SmallShape | ShapeError]:
     """Shapes whose files could not be kept, in memory."""
     read: dict[str, SmallShape | ShapeError] = {}
     for shape in tqdm(shapes, desc=f"reading {name}", unit="shape", disable=not (progress and shapes)):
         try:
-            read[shape] = shrink(read_shape(root, shape), sizes)
+            read[shape] = tree.read(shape)
         except ShapeError as error:
             read[shape] = error
         except UserError as error:
-            raise UserError(f"{root}: {error}") from None
+            raise UserError(f"{tree.root}: {error}") from None
     return read
 
 
