@@ -36,6 +36,18 @@ def files_of(root):
     }
 
 
+def ends(group, seconds=60):
+    """True if all processes of the group end by themselves."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
 def test_a_killed_run_leaves_no_process_and_is_finished_by_the_next(tmp_path):
     save_boxes(tmp_path / "in")
     out = tmp_path / "out"
@@ -50,9 +62,7 @@ def test_a_killed_run_leaves_no_process_and_is_finished_by_the_next(tmp_path):
     started = len(list(out.glob(f"{store.RENDERS}/*/box*")))
     assert 1 <= started < BOXES  # it was killed in the middle
     assert not (out / store.LISTS).exists()
-    while _is_alive(group=run.pid) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not _is_alive(group=run.pid)  # its workers went with it
+    assert ends(run.pid)  # its workers went with it
 
     report = convert([tmp_path / "in"], out, processes=1, **SETTINGS)
     assert report.made + report.kept == BOXES
@@ -61,12 +71,25 @@ def test_a_killed_run_leaves_no_process_and_is_finished_by_the_next(tmp_path):
     assert files_of(out) == files_of(tmp_path / "whole")
 
 
-def _is_alive(group):
-    try:
-        os.killpg(group, 0)
-    except ProcessLookupError:
-        return False
-    return True
+def test_an_interrupted_run_ends_at_once_with_one_word(tmp_path):
+    """Also its workers, which a terminal interrupts as well, while they are still starting."""
+    save_boxes(tmp_path / "in")
+    run = subprocess.Popen(
+        command(tmp_path / "in", tmp_path / "out", 2),
+        start_new_session=True,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "out" / "made_with.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    time.sleep(1)
+    os.killpg(run.pid, signal.SIGINT)
+    _, errors = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert errors.splitlines()[-1] == "interrupted"
+    assert "Traceback" not in errors
+    assert ends(run.pid)
 
 
 @pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs limits of the system")

@@ -130,6 +130,31 @@ def test_materials_and_textures_of_an_archive_reach_the_picture(tmp_path):
     assert columns[0] < columns[1]
 
 
+def test_a_texture_lies_the_same_way_in_every_format(tmp_path):
+    """A board on a foot with a picture of four colours: OBJ, GLB and glTF with files beside it."""
+    picture = np.zeros((8, 8, 3), np.uint8)
+    picture[:4, :4], picture[:4, 4:], picture[4:, :4] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+    corners = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), (0, -1, -0.5)]
+    uv = [(0, 0), (1, 0), (1, 1), (0, 1), (0.5, 0)]
+    visual = trimesh.visual.TextureVisuals(
+        uv=uv, material=trimesh.visual.material.SimpleMaterial(Image.fromarray(picture))
+    )
+    faces = [(0, 1, 2), (0, 2, 3), (0, 1, 4)]
+    scene = trimesh.Scene(trimesh.Trimesh(corners, faces, visual=visual, process=False))
+    scene.export(tmp_path / "x.glb")
+    for suffix in ("obj", "gltf"):
+        (tmp_path / suffix).mkdir()
+        scene.export(tmp_path / suffix / f"x.{suffix}")
+    camera = draw_camera(np.random.default_rng(0), 4, 64)
+    pictures = [
+        Renderer(load_surface(tmp_path / name)).render(camera).images.astype(int)
+        for name in ("obj/x.obj", "gltf/x.gltf", "x.glb")
+    ]
+    assert np.ptp(pictures[0], axis=-1).max() > 100
+    for other in pictures[1:]:
+        assert (np.abs(other - pictures[0]) > 12).any(-1).mean() < 0.01
+
+
 def test_vertex_and_face_colours(tmp_path):
     box = trimesh.creation.box()
     red, blue = (np.tile((*rgb, 255), (count, 1)) for rgb, count in (((255, 0, 0), 12), ((0, 0, 255), 8)))

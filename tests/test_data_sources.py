@@ -88,6 +88,18 @@ def test_single_files_are_what_their_folders_say(tmp_path):
         assert [mesh.synset for mesh in meshes] == ["04256520" if folder == "sofas" else "unknown"]
 
 
+def test_a_mesh_that_is_named_twice_counts_once_and_libraries_may_share_a_name(tmp_path):
+    for place in ("here", "there"):
+        (tmp_path / place / "models" / "sofa").mkdir(parents=True)
+        BOX.export(tmp_path / place / "models" / "sofa" / "x.off")
+    here, there = tmp_path / "here" / "models", tmp_path / "there" / "models"
+    meshes, _ = find_meshes([here, here / "sofa" / "x.off", here / ".." / "models", there], tmp_path)
+    assert [mesh.path.resolve() for mesh in meshes] == [here / "sofa" / "x.off", there / "sofa" / "x.off"]
+    first, second = shape_ids(meshes)
+    assert first.startswith("04256520/x-")
+    assert second == f"{first}-2"
+
+
 @pytest.mark.parametrize(
     ("category", "synset"),
     [

@@ -96,7 +96,7 @@ def find_meshes(
     """
     meshes: list[MeshFile] = []
     refused: dict[str, str] = {}
-    for source in sources:
+    for source in {source.resolve(): source for source in sources}.values():
         if not source.exists():
             raise UserError(f"no such file or folder: {source}")
         if source.is_dir():
@@ -123,7 +123,8 @@ def find_meshes(
             refused |= unpack(archive, folder)
             upright = None if is_library(folder) else UPRIGHT[up]
             meshes += _in_folder(folder, archive.name, upright, catalogue_rotations(folder))
-    return meshes, refused
+    once = {mesh.path.resolve(): mesh for mesh in reversed(meshes)}  # a source may lie in another
+    return list(reversed(once.values())), refused
 
 
 def _in_folder(
@@ -252,10 +253,14 @@ def shape_ids(meshes: Sequence[MeshFile]) -> list[str]:
     """
     plain = [_plain_name(mesh) for mesh in meshes]
     uses = Counter(f"{mesh.synset}/{name.lower()}" for mesh, (name, _) in zip(meshes, plain, strict=True))
-    ids = []
+    ids: list[str] = []
+    hashes: Counter[str] = Counter()
     for mesh, (name, exact) in zip(meshes, plain, strict=True):
         if not exact or uses[f"{mesh.synset}/{name.lower()}"] > 1:
             name = f"{name}-{hashlib.sha256(mesh.name.encode()).hexdigest()[:8]}"
+            hashes[name] += 1
+            if hashes[name] > 1:  # libraries of one name
+                name = f"{name}-{hashes[name]}"
         ids.append(f"{mesh.synset}/{name}")
     return ids
 

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing.context import SpawnContext
 from typing import Any, TypeVar
 
@@ -68,14 +69,20 @@ def _in_pool(
     # Not forked: a child of a process with torch's or Taichi's threads can hang.
     context = multiprocessing.get_context("spawn")
     left = dict.fromkeys(range(len(jobs)))
+    others = set(multiprocessing.active_children())
     while left:
         pool = ProcessPoolExecutor(min(processes, len(left)), mp_context=context, initializer=_follow_parent)
-        futures = {pool.submit(function, jobs[number]): number for number in left}
+        with _without_interrupts():
+            futures = {pool.submit(function, jobs[number]): number for number in left}
         try:
             for future in as_completed(futures):
                 result = future.result()
                 del left[futures[future]]
                 yield jobs[futures[future]], result
+        except KeyboardInterrupt:  # whoever asked for it does not wait for the jobs that are under way
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.terminate()
+            raise
         except BrokenProcessPool:
             for number in list(left)[:processes]:  # jobs start in order: it worked on the first ones not done
                 del left[number]
@@ -87,14 +94,28 @@ def _in_pool(
 def _alone(function: Callable[[Job], Any], job: Job, context: SpawnContext) -> Any:
     with ProcessPoolExecutor(1, mp_context=context, initializer=_follow_parent) as pool:
         try:
-            return pool.submit(function, job).result()
+            with _without_interrupts():
+                future = pool.submit(function, job)
+            return future.result()
         except BrokenProcessPool:
             return OSError("the process that worked on it crashed or ran out of memory")
 
 
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Processes started in this block leave Ctrl-C to their parent, from their first moment on."""
+    if threading.current_thread() is not threading.main_thread():  # where Python allows no handlers
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
 def _follow_parent() -> None:
-    """Leave Ctrl-C to the parent, and end with it: the children of a killed process would wait for work for ever."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """End with the parent: the children of a killed process would wait for work for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
