@@ -179,6 +179,21 @@ AGREEING = {
 }
 
 
+def test_slivers_seen_edge_on_get_no_depth_of_their_own(caster):
+    """Triangles thinner than rounding, fanned through the viewing rays: before and behind the ball there is nothing."""
+    rng = np.random.default_rng(0)
+    ends = rng.normal(size=(3000, 2, 3))
+    ends *= 0.4 / np.linalg.norm(ends, axis=-1, keepdims=True)
+    slivers = np.concatenate((ends, ends[:, :1] + rng.normal(scale=1e-9, size=(3000, 1, 3))), axis=1)
+    fan = np.array([(0.0, 0, 0.5), (0, 0, -0.5), (0, 0.4, 0)])  # holds the eye in its plane
+    corners = np.concatenate((slivers.reshape(-1, 3), fan))
+    surface = Surface.plain(corners, np.arange(len(corners)).reshape(-1, 3), np.ones((3001, 3)))
+    depth = Renderer(surface, caster).render(orbit_camera(np.zeros(1), np.zeros(1), 224)).depth
+    seen = depth[np.isfinite(depth)]
+    assert ((seen > 1.49) & (seen < 2.51)).all()
+    assert np.isfinite(depth).mean() < 0.01
+
+
 @needs_embree
 @pytest.mark.parametrize("name", AGREEING)
 def test_embree_and_the_z_buffer_agree(name):

@@ -19,6 +19,9 @@ _FACES_AT_ONCE = 1 << 16
 _ITEMS_AT_ONCE = 1 << 18
 """Spans or pixels; with the faces, what bounds the memory: about 100 MB, whatever the mesh."""
 
+_SLIVER = 1e-6
+"""Square pixels, about: what is seen edge-on has no depth that rounding would leave, and meets no pixel's centre."""
+
 
 class Rasteriser:
     """Finds what the rays through pixel centres hit first, triangle by triangle.
@@ -76,9 +79,8 @@ def _spans(triangles: np.ndarray, height: int, width: int) -> Iterator[_Spans]:
     edges = np.cross(triangles[[1, 2, 0]], triangles[[2, 0, 1]])
     volume = np.einsum("tc,tc->t", triangles[0], edges[0])
     edges *= np.sign(volume)[:, None]
-    rows = np.where(volume == 0, 0, last[drawn, 1] - top + 1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse_depth = edges.sum(0) / np.abs(volume)[:, None]
+    rows = np.where(np.abs(volume) < _SLIVER, 0, last[drawn, 1] - top + 1)
+    inverse_depth = edges.sum(0) / np.maximum(np.abs(volume), _SLIVER)[:, None]
     for each, within in _expanded(rows):
         row = top[each] + within
         left, right = np.zeros(len(row)), np.full(len(row), width - 1.0)
@@ -106,9 +108,8 @@ def _draw(spans: _Spans, first_face: int, face: np.ndarray, depth: np.ndarray) -
         nearer = np.flatnonzero(new < depth[pixel])
         each, pixel, new = each[nearer], pixel[nearer], new[nearer]
         np.minimum.at(depth, pixel, new)
-        won = np.flatnonzero(new == depth[pixel])[
-            ::-1
-        ]  # where an index comes twice, the last one written stays
+        # Backwards, for where a pixel comes twice the last one written stays.
+        won = np.flatnonzero(new == depth[pixel])[::-1]
         face[pixel[won]] = first_face + spans.triangle[each[won]]
 
 
