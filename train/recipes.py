@@ -28,7 +28,7 @@ def _rates(first: float, final: float | None = None) -> dict[str, float]:
 _STAGES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
     "psgn": {
         "full": ({"steps": 100_000, "shapes": 16, "select": "cd_1"} | _rates(1e-4),),
-        "cpu": ({"steps": 6_000, "shapes": 16, "warmup": 200, "select": "cd_1"} | _rates(5e-4, 2e-5),),
+        "cpu": ({"steps": 5_000, "shapes": 16, "warmup": 200, "select": "cd_1"} | _rates(5e-4, 2e-5),),
         "smoke": ({"steps": 12, "shapes": 3, "select": "cd_1"} | _rates(5e-4),),
     },
     "psgn-mon": {
@@ -45,8 +45,8 @@ _STAGES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
             {"steps": 100_000, "shapes": 20, "select": "cd"} | _rates(1e-5),
         ),
         "cpu": (
-            {"steps": 3_000, "shapes": 16, "select": "cd"} | _rates(2e-3, 1e-4),
-            {"steps": 1_500, "shapes": 8, "select": "cd"} | _rates(1e-4, 1e-5),
+            {"steps": 8_000, "shapes": 16, "select": "cd"} | _rates(2e-3, 1e-4),
+            {"steps": 2_000, "shapes": 16, "select": "cd"} | _rates(1e-4, 1e-5),
         ),
         "smoke": (
             {"steps": 12, "shapes": 3, "select": "cd"} | _rates(1e-3),
@@ -59,8 +59,8 @@ _STAGES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
             {"steps": 40_000, "shapes": 24, "views": 5, "select": "cd", "weight_decay": 5e-5} | _rates(1e-5),
         ),
         "cpu": (
-            {"steps": 1_500, "shapes": 4, "views": 3, "select": "cd"} | _rates(5e-4),
-            {"steps": 700, "shapes": 4, "views": 3, "select": "cd"} | _rates(1e-4, 1e-5),
+            {"steps": 1_400, "shapes": 4, "views": 3, "select": "cd"} | _rates(5e-4),
+            {"steps": 600, "shapes": 4, "views": 3, "select": "cd"} | _rates(1e-4, 1e-5),
         ),
         "smoke": (
             {"steps": 12, "shapes": 3, "views": 2, "select": "cd"} | _rates(1e-3),
@@ -69,7 +69,7 @@ _STAGES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
     },
     "ptn": {
         "full": ({"steps": 100_000, "shapes": 6, "select": "cd", "weight_decay": 1e-3} | _rates(1e-4),),
-        "cpu": ({"steps": 3_000, "shapes": 6, "select": "cd"} | _rates(5e-4, 5e-5),),
+        "cpu": ({"steps": 4_000, "shapes": 6, "warmup": 100, "select": "cd"} | _rates(5e-4, 5e-5),),
         "smoke": ({"steps": 12, "shapes": 3, "select": "cd"} | _rates(5e-4),),
     },
 }  # fmt: skip

@@ -16,9 +16,9 @@ _POINT_RADIUS = 0.01
 def solid_cells(truth: Truth, size: int) -> Tensor:
     """Which cells of the cube [-0.5, 0.5]^3 a shape fills: (B, G, G, G) bool, along x, y and z.
 
-    A cell is empty when some view sees its centre lying before the surface or before nothing; the rest is filled, and
-    so is every cell that holds a point of the surface: thin parts miss the centres. What no view looks into counts
-    as filled.
+    A cell is empty when some view sees its centre lying before the surface or before nothing, or when its centre lies
+    beside the box around the surface's points. The rest is filled, also what no view looks into; and so is every cell
+    that holds a point of the surface: thin parts miss the centres.
 
     Args:
         truth: the shapes.
@@ -39,7 +39,9 @@ def solid_cells(truth: Truth, size: int) -> Tensor:
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (depth > 0)
     place = torch.where(inside, y * width + x, 0)
     surface = truth.depth.flatten(2).gather(2, place)
-    filled = ~(inside & (depth < surface)).any(1)
+    lowest, highest = truth.points.amin(1, keepdim=True), truth.points.amax(1, keepdim=True)
+    in_box = ((centres >= lowest) & (centres <= highest)).all(-1)
+    filled = in_box & ~(inside & (depth < surface)).any(1)
     cell = ((truth.points + 0.5) * size).floor().long()
     held = ((cell >= 0) & (cell < size)).all(-1)
     x, y, z = cell.unbind(-1)

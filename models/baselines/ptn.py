@@ -19,10 +19,14 @@ from torch.nn import functional as F
 
 from diffpoint import PinholeCamera
 from models.baselines.base import Baseline, BaselineConfig, choose_config, initialise_rectified
-from models.baselines.voxels import surface_points
+from models.baselines.voxels import cell_centres, surface_points
 
 _THRESHOLD = 0.5
 _RAY_SAMPLES = 32
+_GRID_SIZE = 32
+# World units, and half a cell more: an object has a diagonal of one. Cells beyond it, into which not every camera looks,
+# would never be emptied.
+_OBJECT_RADIUS = 0.5 + 0.5 / _GRID_SIZE
 # The cube [-0.5, 0.5]^3 seen from any side lies within this distance of the origin's depth.
 _HALF_DIAGONAL = math.sqrt(3) / 2
 
@@ -67,9 +71,10 @@ def build_ptn(profile: str = "cpu", *, config: PTNConfig | None = None) -> Silho
 
 
 class SilhouetteReconstruction(Baseline):
-    """One image -> occupancies in [0, 1]."""
+    """One image -> occupancies in [0, 1], 0 beyond the ball of an object's size."""
 
     config: PTNConfig
+    inside: Tensor
 
     def __init__(self, config: PTNConfig) -> None:
         super().__init__()
@@ -90,10 +95,19 @@ class SilhouetteReconstruction(Baseline):
             nn.ConvTranspose3d(third, 1, 6, 2, 1),
         )
         initialise_rectified(self)
+        last = self.decoder[-1]
+        assert isinstance(last, nn.ConvTranspose3d)
+        assert last.bias is not None
+        with torch.no_grad():
+            # All cells start nearly undecided, and those that no ray meets stay empty.
+            last.weight.mul_(0.1)
+            last.bias.fill_(-1.0)
+        inside = cell_centres(_GRID_SIZE).norm(dim=1) <= _OBJECT_RADIUS
+        self.register_buffer("inside", inside.float().unflatten(0, (_GRID_SIZE,) * 3), persistent=False)
 
     def occupancy(self, images: Tensor) -> Tensor:
         """(B, 3, H, W) in [0, 1] -> (B, 32, 32, 32) in [0, 1], with gradient."""
-        return self.decoder(self.encoder(self._prepare(images)))[:, 0].sigmoid()
+        return self.inside * self.decoder(self.encoder(self._prepare(images)))[:, 0].sigmoid()
 
     def _answers(self, images: Tensor) -> Tensor:
         occupancy = self.occupancy(images.flatten(0, 1))

@@ -106,6 +106,9 @@ class RecurrentReconstruction(Baseline):
         initialise_rectified(self)
         self.memory.initialise()
         nn.init.normal_(self.logits_of_cells.weight, std=0.01)
+        for module in self.modules():
+            if isinstance(module, nn.Conv3d):  # on a CPU a fifth of the time of a training step
+                module.to(memory_format=torch.channels_last_3d)  # pyright: ignore[reportCallIssue]
 
     @property
     def grid_size(self) -> int:
