@@ -6,6 +6,7 @@ import errno
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -72,7 +73,7 @@ def _in_pool(
     others = set(multiprocessing.active_children())
     while left:
         pool = ProcessPoolExecutor(min(processes, len(left)), mp_context=context, initializer=_follow_parent)
-        with _without_interrupts():
+        with _without_interrupts(), _without_main():
             futures = {pool.submit(function, jobs[number]): number for number in left}
         try:
             for future in as_completed(futures):
@@ -94,7 +95,7 @@ def _in_pool(
 def _alone(function: Callable[[Job], Any], job: Job, context: SpawnContext) -> Any:
     with ProcessPoolExecutor(1, mp_context=context, initializer=_follow_parent) as pool:
         try:
-            with _without_interrupts():
+            with _without_interrupts(), _without_main():
                 future = pool.submit(function, job)
             return future.result()
         except BrokenProcessPool:
@@ -112,6 +113,23 @@ def _without_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, handler)
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Processes started in this block do not import the program's main script, which they have no use for.
+
+    A script without `if __name__ == "__main__"` would begin again in each of them, and wait there for its parent.
+    """
+    main = sys.modules["__main__"]
+    hidden = {name: getattr(main, name) for name in ("__spec__", "__file__") if hasattr(main, name)}
+    for name in hidden:
+        setattr(main, name, None)
+    try:
+        yield
+    finally:
+        for name, value in hidden.items():
+            setattr(main, name, value)
 
 
 def _follow_parent() -> None:
