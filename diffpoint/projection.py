@@ -5,12 +5,15 @@ Beside the front constraint of `losses.py`: the same arguments, the same rendere
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from diffpoint import _checks
 from diffpoint.camera import PinholeCamera, check_views
+from diffpoint.distances import nearest
 from diffpoint.losses import Reduction, check_maps, reduce_loss
 from diffpoint.reproject import check_depth
 from diffpoint.soft_splat import soft_splat
@@ -18,6 +21,8 @@ from diffpoint.splat import splat_depth
 
 EMPTY_LOGIT = -1.0
 """Of a pixel that nothing falls into, as in the released code of Lin et al."""
+_INK = 2.0  # pixels that a point can cover: with as many points as pixels in the silhouette, few stay empty
+_FREE = 0.01  # coverage of every pixel: bounds the loss of an empty one, and the pull on the first point to touch it
 
 
 def projection_loss(
@@ -104,8 +109,8 @@ def _pseudo_render(
         m.unflatten(3, (-1, upsample)).unflatten(2, (-1, upsample)).transpose(3, 4).flatten(4)
         for m in (rendered, index)
     ]
-    nearest = blocks[0].detach().argmin(-1, keepdim=True)
-    return tuple(torch.take_along_dim(m, nearest, -1)[..., 0] for m in blocks)  # type: ignore[return-value]
+    closest = blocks[0].detach().argmin(-1, keepdim=True)
+    return tuple(torch.take_along_dim(m, closest, -1)[..., 0] for m in blocks)  # type: ignore[return-value]
 
 
 def _render_existing(
@@ -138,53 +143,100 @@ def soft_projection_loss(
 ) -> Tensor:
     """The projection loss through `soft_splat`, whose depth and mask follow a point that moves sideways.
 
-    Per view: the mean over foreground pixels of mask * |soft depth - true depth|, plus `mask_weight` times the mean
-    over all pixels of the binary cross entropy between soft mask and silhouette. Outside the silhouette that is the
-    coverage itself; on an empty foreground pixel it is bounded by a coverage of 0.01 that every pixel has for free.
+    Per view, in sums over pixels divided by the number of foreground pixels:
+
+    - on the foreground, mask * |soft depth - true depth|;
+    - on the foreground, -log(mask), times `mask_weight`: empty pixels pull, crowded ones do not;
+    - on the background, coverage * distance to the silhouette in pixels, times `mask_weight`. The binary cross entropy
+      would be the coverage alone, which a point in the middle of the background cannot change by moving.
+
+    The coverage of a point, spread over however large a footprint, sums up to two pixels. The map is rendered with a
+    margin of half its side, which counts as background, so that leaving the frame does not pay.
 
     Args:
         points: (B, N, 3) predicted clouds in the world.
         camera: batch shape (), (V,) or (B, V), of the depth maps' size.
         depth: (B, V, H, W) true depth maps, +inf where empty.
-        radius: of the footprints in pixels: how far a pixel, empty or wrongly covered, pulls or pushes a point.
+        radius: of the footprints in pixels: how far an empty pixel of the foreground reaches. Start with 6 or 8, end
+            with 1.
         softness: of the depth order, in world units.
-        mask_weight: of the mask term, in world units.
+        mask_weight: of the terms on the mask, in world units.
         reduction: "mean" over all views, or "none" for (B, V).
 
     Returns:
         The loss in world units.
 
-    Gradients: to x, y and z of the points that cover a pixel, and to the camera's matrices. A point further than
-        `radius` from the silhouette and from every pixel of other coverage is not told where to go.
+    Gradients: to x, y and z of the points whose footprint touches the map or its margin, and to the camera's matrices;
+        none to `depth` through the shape of the silhouette.
 
     Raises:
         ValueError, TypeError: wrong shapes, dtypes or devices, NaN or infinite coordinates, a radius or softness that
             is not positive and finite, a negative `mask_weight`.
 
-    Source: see `soft_splat`; depth and mask terms as in `projection_loss`.
+    Source: see `soft_splat`. The distance on the background is the affinity term of CAPNet (Navaneet et al., AAAI
+        2019), the rest the depth and mask terms of `projection_loss`.
 
     Example:
         >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=8.0, height=8, width=8)
-        >>> depth = torch.full((1, 1, 8, 8), float("inf")); depth[..., 2:6, 2:6] = 2.0
-        >>> cloud = torch.tensor([[[0.45, 0.0, 0.0]]], requires_grad=True)
+        >>> depth = torch.full((1, 1, 8, 8), float("inf")); depth[..., 3:5, 3:5] = 2.0
+        >>> cloud = torch.tensor([[[-0.45, 0.0, 0.0]]], requires_grad=True)
         >>> soft_projection_loss(cloud, camera, depth).backward()
-        >>> bool(cloud.grad[0, 0, 0] > 0)  # the point lies beside the silhouette: descent moves it in
+        >>> bool(cloud.grad[0, 0, 0] < 0)  # the point lies beside the silhouette: descent moves it in
         True
     """
     _check("soft_projection_loss", points, camera, depth, mask_weight=mask_weight)
     camera = check_views("soft_projection_loss", "camera", camera, points, views=depth.shape[1]).camera
-    soft = soft_splat(points, camera, radius=radius, softness=softness)
+    margin = max(camera.height, camera.width) // 2
+    distance = _distance_to(torch.isfinite(depth), margin).to(points)
+    depth = F.pad(depth, (margin,) * 4, value=math.inf)
+    soft = soft_splat(points, _with_margin(camera, margin), radius=radius, softness=softness)
     foreground = torch.isfinite(depth)
+    count = foreground.sum((-2, -1)).clamp(min=1)
+    volume = math.pi / 3 * radius**2  # of a footprint
+    coverage = _INK / volume * soft.coverage
     both = foreground & torch.isfinite(soft.depth)
     difference = torch.where(both, soft.depth, 0.0) - torch.where(both, depth, 0.0)
-    loss = (soft.mask * difference.abs()).sum((-2, -1)) / foreground.sum((-2, -1)).clamp(min=1)
+    loss = (-torch.expm1(-coverage) * difference.abs()).sum((-2, -1)) / count
     if mask_weight:
-        missing = -torch.log(-torch.expm1(-(soft.coverage + _FREE)))
-        loss = loss + mask_weight * torch.where(foreground, missing, soft.coverage).mean((-2, -1))
+        missing = -torch.log(-torch.expm1(-(coverage + _FREE)))
+        wrong = torch.where(foreground, missing, distance * coverage)
+        loss = loss + mask_weight * wrong.sum((-2, -1)) / count
     return reduce_loss("soft_projection_loss", loss, reduction)
 
 
-_FREE = 0.01  # coverage of every pixel: bounds the loss of an empty one, and the pull on the first point to touch it
+def _with_margin(camera: PinholeCamera, margin: int) -> PinholeCamera:
+    """The same view on a map with `margin` more pixels on every side."""
+    shift = torch.zeros_like(camera.K)
+    shift[..., :2, 2] = margin
+    return PinholeCamera(
+        camera.K + shift, camera.cam_from_world, camera.height + 2 * margin, camera.width + 2 * margin
+    )
+
+
+def _distance_to(foreground: Tensor, margin: int) -> Tensor:
+    """Distance in pixels of each pixel to the nearest of the foreground; 1 where there is none.
+
+    On a map with `margin` more pixels on every side than `foreground` (B, V, H, W), plus the way to the frame.
+    """
+    height, width = foreground.shape[-2:]
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack((columns, rows, torch.zeros_like(rows)), -1).reshape(-1, 3)
+    pixels = pixels.to(foreground.device, torch.float32)
+    flat = foreground.reshape(-1, height * width)
+    counts = flat.sum(1)
+    longest = int(counts.max()) if len(flat) else 0
+    first = flat.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :longest]
+    squared = nearest(pixels.expand(len(flat), -1, -1), pixels[first], b_lengths=counts).squared_distance
+    distance = torch.where(torch.isfinite(squared), squared, 1.0).sqrt().view(foreground.shape)
+    (row, down), (column, across) = (_beyond(size, margin, distance) for size in (height, width))
+    return distance[..., row, :][..., column] + torch.hypot(across, down[:, None])
+
+
+def _beyond(size: int, margin: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Of size + 2 margin pixels: the nearest one in the frame, and how far it is."""
+    at = torch.arange(-margin, size + margin, device=like.device)
+    framed = at.clamp(0, size - 1)
+    return framed, (at - framed).abs().to(like)
 
 
 def _check(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import torch
 from torch import Tensor
@@ -103,17 +104,29 @@ def soft_projection_loss(
     softness: float,
     mask_weight: float,
 ) -> Tensor:
-    """(B, V)."""
-    rendered, coverage = soft_splat(
-        points, K, cam_from_world, (depth.shape[-2], depth.shape[-1]), radius=radius, softness=softness
-    )
+    """(B, V): the map with its margin, one view and one background pixel after the other."""
+    height, width = depth.shape[-2:]
+    margin = max(height, width) // 2
+    size = height + 2 * margin, width + 2 * margin
+    shifted = K.clone()
+    shifted[..., :2, 2] += margin
+    rendered, coverage = soft_splat(points, shifted, cam_from_world, size, radius=radius, softness=softness)
+    coverage = 2 * coverage / (math.pi * radius**2 / 3)
+    inner = slice(margin, margin + height), slice(margin, margin + width)
     losses = []
     for b, v in itertools.product(*map(range, depth.shape[:2])):
-        foreground = torch.isfinite(depth[b, v])
+        truth = depth.new_full(size, torch.inf)
+        truth[inner] = depth[b, v]
+        foreground = torch.isfinite(truth)
+        covered = coverage[b, v]
         both = foreground & torch.isfinite(rendered[b, v])
-        mask = 1 - torch.exp(-coverage[b, v])
-        error = (mask[both] * (rendered[b, v][both] - depth[b, v][both]).abs()).sum()
-        missing = 1 - torch.exp(-coverage[b, v][foreground] - 0.01)
-        wrong = coverage[b, v][~foreground].sum() - missing.log().sum()
-        losses.append(error / max(int(foreground.sum()), 1) + mask_weight * wrong / foreground.numel())
+        error = ((1 - torch.exp(-covered[both])) * (rendered[b, v][both] - truth[both]).abs()).sum()
+        wrong = -(1 - torch.exp(-covered[foreground] - 0.01)).log().sum()
+        silhouette = foreground.nonzero().to(points)
+        for row, column in (~foreground).nonzero().tolist():
+            at = silhouette.new_tensor([row, column])
+            framed = at.clamp(min=margin).minimum(at.new_tensor([margin + height - 1, margin + width - 1]))
+            away = (silhouette - framed).norm(dim=1).min() if len(silhouette) else 1.0
+            wrong = wrong + covered[row, column] * (away + (at - framed).norm())
+        losses.append((error + mask_weight * wrong) / max(int(foreground.sum()), 1))
     return torch.stack(losses).view(depth.shape[:2])

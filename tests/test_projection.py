@@ -87,6 +87,19 @@ def test_only_the_soft_loss_moves_points_sideways():
     assert soft[..., :2].norm() / soft.norm() > 0.2
 
 
+@pytest.mark.parametrize("at", [(-0.48, -0.1), (0.49, 0.3), (0.0, -0.49), (-0.55, 0.0), (0.52, -0.52)])
+def test_the_soft_loss_pulls_points_from_wherever_they_are_to_the_silhouette(at):
+    """In the middle of the background, at the frame's edge, and just beyond it."""
+    view = dp.PinholeCamera(torch.tensor([[30.0, 0, 15], [0, 30.0, 15], [0, 0, 1]]), torch.eye(4), 30, 30)
+    depth = torch.full((1, 1, 30, 30), torch.inf)
+    depth[..., 13:17, 13:17] = 1.0
+    point = torch.tensor([[[*at, 1.0]]], requires_grad=True)
+    for radius in (2.0, 6.0):
+        (gradient,) = torch.autograd.grad(dp.soft_projection_loss(point, view, depth, radius=radius), point)
+        away = point.detach()[0, 0, :2]
+        assert (gradient[0, 0, :2] * away).sum() > 0.3 * gradient[0, 0, :2].norm() * away.norm(), radius
+
+
 @pytest.mark.parametrize("logit", [2.0, -2.0])
 def test_the_mask_term_raises_logits_inside_the_silhouette_and_lowers_those_outside(logit):
     """Whether the points exist or not: it deletes them and brings them back."""
