@@ -92,6 +92,34 @@ class Meshes:
 
 
 @dataclasses.dataclass
+class Photos:
+    """Cut objects out of photographs: alone on white, in a square, as large as in training; no cameras needed.
+
+    One folder for each object, one folder of one object, or Stanford Online Products. The object is told from the rest
+    by a mask beside the photograph (NAME_mask.png or masks/NAME.png), by transparency, or by a plain background.
+    """
+
+    source: Positional[Path]
+    """Folder of the photographs."""
+    out: Path
+    """New folder: OUT/OBJECT/NAME.png to reconstruct from, and OUT/OBJECT/masks/NAME.png to look at."""
+    size: int = 224
+    """Side of the pictures in pixels."""
+    fewest: int = 1
+    """Leave out objects with fewer photographs."""
+    objects: int | None = None
+    """At most so many objects."""
+
+    def run(self) -> None:
+        from train.data.photos import convert_photos
+
+        report = convert_photos(
+            self.source, self.out, size=self.size, fewest=self.fewest, objects=self.objects
+        )
+        print(report.summary())
+
+
+@dataclasses.dataclass
 class Check:
     """Look through a data tree: what is there, what is broken, whether cameras, depth and clouds agree."""
 
@@ -165,6 +193,7 @@ class Data:
     action: OmitArgPrefixes[
         Annotated[Procedural, subcommand("procedural")]
         | Annotated[Meshes, subcommand("meshes")]
+        | Annotated[Photos, subcommand("photos")]
         | Annotated[Check, subcommand("check")]
         | Annotated[Show, subcommand("show")]
         | Annotated[Rules, subcommand("rules")]

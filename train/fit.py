@@ -19,6 +19,7 @@ from tqdm import tqdm
 from train.batches import LoadedSplit, load_split
 from train.checkpoint import best_weights, latest_checkpoint, load_autoencoder, save_checkpoint, save_weights
 from train.config import FitConfig, fit_config_from_json, to_json
+from train.data.tree import require_depth
 from train.errors import UserError
 from train.files import write_text
 from train.interrupts import StopRequest
@@ -67,6 +68,7 @@ def fit(
     world = gather()
     progress = progress and world.writes
     _check_run_directory(out, config, resume=resume)
+    require_depth([data] if isinstance(data, Path) else data)
     read = functools.partial(
         load_split,
         data,

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from train.errors import UserError
 
 _SMALLEST = 16
-_WHITE_ENOUGH = 0.85
+_WHITE = 0.985
 _BLANK = 0.97
 
 
@@ -42,6 +42,26 @@ def read_images(paths: Sequence[Path], *, size: int = 224) -> Tensor:
 
 def _read(path: Path) -> Tensor:
     """(3, H, W) in [0, 1] on white."""
+    picture = on_white(_decode(path))
+    if picture.min() > _BLANK:
+        raise UserError(f"{path} shows nothing: it is white or transparent everywhere")
+    return picture
+
+
+def read_rgba(path: Path) -> np.ndarray:
+    """(H, W, 4) float32 in [0, 1], upright; alpha is 1 everywhere if the file has none.
+
+    Raises:
+        UserError: the file is missing, is no image, or is too small to show an object.
+    """
+    values = _scaled(_decode(path))
+    colours = values[..., :3] if values.shape[2] > 2 else values[..., :1]
+    alpha = values[..., -1:] if values.shape[2] in (2, 4) else np.ones_like(values[..., :1])
+    return np.concatenate((np.broadcast_to(colours, (*values.shape[:2], 3)), alpha), axis=2)
+
+
+def _decode(path: Path) -> np.ndarray:
+    """(H, W, channels) as decoded, upright."""
     if not path.is_file():
         raise UserError(f"{path} does not exist or is no file; name the images to reconstruct from")
     try:
@@ -59,10 +79,13 @@ def _read(path: Path) -> Tensor:
         raise UserError(
             f"{path} is {width} x {height} pixels; at least {_SMALLEST} x {_SMALLEST} are needed to show an object"
         )
-    picture = on_white(pixels)
-    if picture.min() > _BLANK:
-        raise UserError(f"{path} shows nothing: it is white or transparent everywhere")
-    return picture
+    return pixels
+
+
+def _scaled(pixels: np.ndarray) -> np.ndarray:
+    """As float32 in [0, 1]."""
+    top = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1.0
+    return np.asarray(pixels, np.float32) / np.float32(top)
 
 
 def _pixels(image: Image.Image) -> np.ndarray:
@@ -74,20 +97,20 @@ def _pixels(image: Image.Image) -> np.ndarray:
     return np.atleast_3d(np.asarray(image))
 
 
-def on_dark(images: Tensor) -> list[int]:
-    """Numbers of the square images (V, 3, S, S) of which two sides or more are not white: a background is there.
+def is_cut_out(rgba: np.ndarray) -> bool:
+    """True for a picture (H, W, 4) that shows an object alone: it has transparency, or three of its sides are white.
 
-    One side may be the object's, and two the white that made the picture square.
+    The fourth may be the object's. White is white paper in a file, not a photograph of it.
     """
-    sides = torch.stack([images[..., 0, :], images[..., -1, :], images[..., 0], images[..., -1]])
-    second_darkest = sides.mean(2).median(2).values.sort(0).values[1]
-    return [i for i, value in enumerate(second_darkest.tolist()) if value < _WHITE_ENOUGH]
+    if (rgba[..., 3] < 0.5).any():
+        return True
+    sides = (rgba[0], rgba[-1], rgba[:, 0], rgba[:, -1])
+    return sum(float(np.quantile(side[:, :3].min(1), 0.1)) >= _WHITE for side in sides) >= 3
 
 
 def on_white(pixels: np.ndarray) -> Tensor:
     """Decoded pixels (H, W, 1 to 4), grey or colour with or without alpha, as (3, H, W) in [0, 1]; holes are white."""
-    top = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1.0
-    values = np.asarray(pixels, np.float32) / np.float32(top)
+    values = _scaled(pixels)
     if values.shape[2] in (2, 4):
         alpha = values[..., -1:]
         values = values[..., :-1] * alpha + (1 - alpha)

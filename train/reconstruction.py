@@ -6,14 +6,20 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from diffpoint.io import write_points
+from train.data.choy import pictures_of
+from train.data.cutout import cut_out
 from train.errors import UserError
 from train.files import replacing
-from train.images import on_dark, read_images
+from train.images import is_cut_out, read_images, read_rgba
 from train.inference import reconstruct
 from train.runs import open_run
 
 MOST_IMAGES = 24
+_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 
 def reconstruct_to_files(
@@ -34,19 +40,14 @@ def reconstruct_to_files(
     """
     from train.pages import write_reconstruction_page
 
+    images = named_pictures(images)
     if not 1 <= len(images) <= MOST_IMAGES:
         raise UserError(f"reconstruct takes 1 to {MOST_IMAGES} images; got {len(images)}")
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is a file; --out names a directory")
     if (groups is not None and groups < 1) or (steps is not None and steps < 0):
         raise UserError(f"--groups must be at least 1 and --steps at least 0; got {groups} and {steps}")
-    pictures = read_images(images)
-    if dark := on_dark(pictures):
-        names = ", ".join(str(images[i]) for i in dark)
-        print(
-            f"note: {names}: the border is not white; the network expects the object alone, on white or transparent",
-            file=sys.stderr,
-        )
+    pictures = read_pictures(images)
     model, config, _ = open_run(run)
     found = reconstruct(model, pictures, groups=groups, steps=steps, seed=seed, settings=config.inference)
     points = found.points[0]
@@ -59,3 +60,44 @@ def reconstruct_to_files(
         write_reconstruction_page(page, pictures, points, title="Reconstruction", subtitle=made)
         write_points(out / "reconstruction.ply", points)
     print(f"wrote {out}/reconstruction.ply and {out}/reconstruction.html: {made}")
+
+
+def named_pictures(paths: Sequence[Path]) -> list[Path]:
+    """The pictures that were named; a folder stands for those in it, a model of Choy's renderings for its views.
+
+    Raises:
+        UserError: a folder without pictures.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        inside = pictures_of(path) or sorted(p for p in path.iterdir() if p.suffix.lower() in _ENDINGS)
+        if not inside:
+            raise UserError(
+                f"{path} is a folder without pictures; name pictures, or a folder that holds some"
+            )
+        found += inside
+    return found
+
+
+def read_pictures(paths: Sequence[Path]) -> Tensor:
+    """(V, 3, 224, 224) in [0, 1]: cut-outs as they are, photographs with a plain background cut out.
+
+    A picture with transparency or a purely white border is a cut-out; its scale is kept.
+    """
+    pictures = []
+    for path in paths:
+        rgba = read_rgba(path)
+        picture = read_images([path])
+        if not is_cut_out(rgba):
+            try:
+                made = cut_out(rgba, size=picture.shape[-1])
+            except UserError as error:
+                print(f"note: {path}: used whole: {error}", file=sys.stderr)
+            else:
+                print(f"note: {path}: cut out: {made.found}", file=sys.stderr)
+                picture = torch.from_numpy(made.picture).permute(2, 0, 1)[None] / 255
+        pictures.append(picture)
+    return torch.cat(pictures)

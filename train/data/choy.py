@@ -68,6 +68,8 @@ def cam_from_world(
 class Choy:
     """A tree of their renderings, with clouds that the user has put inside or beside it."""
 
+    has_depth = False
+
     def __init__(self, root: Path, renderings: Path) -> None:
         self.root = root
         self._renderings = renderings

@@ -65,6 +65,8 @@ def _fraction(shape: str) -> float:
 class Release:
     """A tree with `rendered-shapenet`, clouds and lists."""
 
+    has_depth = True
+
     def __init__(self, root: Path) -> None:
         if not (root / store.LISTS).is_dir():
             raise UserError(f"the data at {root} are not finished; run the command that makes them again")

@@ -38,7 +38,7 @@ class SmallShape(NamedTuple):
         id: "synset/model".
         category: its name.
         images: (V, 3, h, w) uint8.
-        depth: (V, S, S) float32 metric depth, +inf where empty.
+        depth: (V, S, S) float32 metric depth, +inf where empty; NaN if the shape came without depth maps.
         K: (V, 3, 3) intrinsics for maps of S x S pixels.
         cam_from_world: (V, 4, 4).
         points: (P, 3) ground truth in the world frame.
@@ -69,14 +69,7 @@ def shrink(shape: Shape, sizes: Sizes) -> SmallShape:
     """
     if shape.depth.isinf().flatten(1).all(1).any():
         raise ShapeError(f"{shape.id}: one of its views shows nothing")
-    side = shape.depth.shape[-1]
-    if side % sizes.map_size:
-        raise UserError(
-            f"{shape.id}: renders are {side} pixels wide, not a multiple of the map size {sizes.map_size}; "
-            "render at another size or set --map-size"
-        )
-    pool = decimate_depth if sizes.pool == "decimate" else min_pool_depth
-    small = pool(shape.depth, shape.camera, size=sizes.map_size)
+    small = _small_depth(shape, sizes)
     return SmallShape(
         id=shape.id,
         category=shape.category,
@@ -86,6 +79,20 @@ def shrink(shape: Shape, sizes: Sizes) -> SmallShape:
         cam_from_world=small.camera.cam_from_world,
         points=shape.points,
     )
+
+
+def _small_depth(shape: Shape, sizes: Sizes) -> SmallDepth:
+    side, wanted = shape.depth.shape[-1], sizes.map_size
+    if not shape.has_depth:  # renderings to evaluate on: their pictures and their ground truth count
+        unknown = torch.full((len(shape.depth), wanted, wanted), torch.nan)
+        return SmallDepth(unknown, shape.camera.resize(wanted, wanted))
+    if side % wanted:
+        raise UserError(
+            f"{shape.id}: renders are {side} pixels wide, not a multiple of the map size {wanted}; "
+            "render at another size or set --map-size"
+        )
+    pool = decimate_depth if sizes.pool == "decimate" else min_pool_depth
+    return pool(shape.depth, shape.camera, size=wanted)
 
 
 def _bytes_at(images: Tensor, size: tuple[int, int]) -> Tensor:

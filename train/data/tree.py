@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -111,6 +111,11 @@ class Layout(Protocol):
 
     root: Path
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether its shapes can be trained on."""
+        ...
+
     def listed(self, split: str) -> dict[str, list[str]]:
         """Synset -> the shapes of a split, whether they are there or not."""
         ...
@@ -146,6 +151,20 @@ def layout_of(root: Path) -> Layout:
             f"no data at {root}; make some with: python -m train data procedural --out {root} --shapes 400"
         )
     return Choy(root, renderings)
+
+
+def require_depth(roots: Iterable[Path]) -> None:
+    """Refuse trees that cannot be trained on.
+
+    Raises:
+        UserError: a tree has no depth maps, or there is no tree.
+    """
+    for root in roots:
+        if not layout_of(root).has_depth:
+            raise UserError(
+                f"{root} has no depth maps, and training needs them; such renderings serve reconstruct and evaluate. "
+                "To train, render the meshes: python -m train data meshes SHAPENET --out DIR"
+            )
 
 
 def read_shape(root: Path, shape: str) -> Shape:

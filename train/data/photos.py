@@ -1,0 +1,233 @@
+"""Photographs to what the network expects: the object alone on white, in a square, as large as in training.
+
+    SOURCE/<object>/<name>.jpg                        one folder for each object
+    SOURCE/[chair_final/]<listing>_<number>.JPG       Stanford Online Products: one listing is one object
+    SOURCE/<name>.jpg                                 a single object
+
+become `OUT/<object>/<name>.png`, with `OUT/<object>/masks/<name>.png`, white where the object was found, as large as
+the photograph. A mask beside a photograph (`<name>_mask.png` or `masks/<name>.png`) goes before its alpha channel, and
+that before a search for a plain background; so a mask that came out wrong is mended by hand and given back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections import Counter, defaultdict
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from train.data import store
+from train.data.cutout import cut_out
+from train.data.work import run_all
+from train.errors import UserError
+from train.files import replacing, write_text
+from train.images import read_rgba
+
+MASKS = "masks"
+
+_ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
+_UNREADABLE = (".heic", ".heif", ".avif", ".dng", ".cr2", ".nef")
+_PRODUCTS = "_final"
+_LISTING = re.compile(r"(\d+)_(\d+)")
+_MASK_FOLDERS = (MASKS, "mask")
+_RECORD = "photos.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Photo:
+    """A photograph in the source: of which object, under which name it is kept, and its given mask."""
+
+    object: str
+    name: str
+    path: Path
+    mask: Path | None
+
+    @property
+    def title(self) -> str:
+        """How it is called in reports."""
+        return f"{self.object}/{self.path.name}"
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotosReport:
+    """What `convert_photos` did; `found` and `failures` say it for each photograph."""
+
+    out: Path
+    kept: int
+    objects: int
+    found: dict[str, str]
+    ways: dict[str, int]
+    failures: dict[str, str]
+
+    def summary(self) -> str:
+        """Lines for the terminal."""
+        earlier = f", {self.kept} were there" if self.kept else ""
+        ways = ", ".join(f"{count} by {way}" for way, count in self.ways.items())
+        lines = [
+            f"{self.out}: cut {len(self.found)} photographs out{f' ({ways})' if ways else ''}{earlier}; "
+            f"{self.objects} object{'s' if self.objects != 1 else ''}"
+        ]
+        lines += _some([f"  {title}: {words}" for title, words in self.found.items()])
+        if self.failures:
+            lines.append(f"{len(self.failures)} photographs were left out:")
+            lines += _some([f"  {title}: {reason}" for title, reason in sorted(self.failures.items())])
+        lines.append(
+            f"look at the masks, then: python -m train reconstruct pretrained {self.out}/OBJECT --out DIR"
+        )
+        return "\n".join(lines)
+
+
+def _some(lines: list[str], most: int = 40) -> list[str]:
+    rest = len(lines) - most
+    return lines if rest <= 0 else [*lines[:most], f"  ... and {rest} more, all in {_RECORD}"]
+
+
+def convert_photos(
+    source: Path,
+    out: Path,
+    *,
+    size: int = 224,
+    fewest: int = 1,
+    objects: int | None = None,
+    processes: int | None = None,
+) -> PhotosReport:
+    """Cut the objects out of photographs; running it again finishes or extends it.
+
+    Args:
+        source: folder of folders, a folder of one object, or Stanford Online Products.
+        out: new folder.
+        size: side of the pictures.
+        fewest: leave out objects with fewer photographs.
+        objects: at most so many, None for all.
+        processes: None for one per core.
+
+    Raises:
+        UserError: no photographs, or not a single usable one; a folder that holds something else.
+    """
+    if not 16 <= size <= 2048:
+        raise UserError(f"size must be between 16 and 2048; got {size}")
+    if fewest < 1 or (objects is not None and objects < 1):
+        raise UserError(f"fewest and objects must be at least 1; got {fewest} and {objects}")
+    by_object, failures = find_photos(source)
+    by_object = {name: photos for name, photos in by_object.items() if len(photos) >= fewest}
+    if not by_object:
+        few = f" of an object with at least {fewest}" if fewest > 1 else ""
+        said = "".join(f"; {name}: {reason}" for name, reason in list(failures.items())[:1])
+        raise UserError(f"no photographs{few} in {source}; looked for {', '.join(_ENDINGS)}{said}")
+    chosen = [photo for name in list(by_object)[:objects] for photo in by_object[name]]
+    store.claim(out, {"kind": "photos", "size": size})
+    for leftover in list(out.glob("**/.*.tmp")):
+        leftover.unlink(missing_ok=True)
+    record = _read_record(out)
+    jobs = [_Job(photo, out, size) for photo in chosen if not _is_done(photo, out)]
+    found: dict[str, str] = {}
+    ways: Counter[str] = Counter()
+    for job, result in run_all(_cut_one, jobs, processes=processes, desc="cutting out", unit="photo"):
+        if isinstance(result, tuple):
+            ways[result[0]] += 1
+            found[job.photo.title] = result[1]
+        else:
+            failures[job.photo.title] = str(result)
+    kept = len(chosen) - len(jobs)
+    if not kept and not found:
+        title, reason = next(iter(failures.items()))
+        others = f" (and {len(failures) - 1} others)" if len(failures) > 1 else ""
+        store.discard(out)
+        raise UserError(f"no photograph can be used; {title}: {reason}{others}")
+    found = {job.photo.title: found[job.photo.title] for job in jobs if job.photo.title in found}
+    record = {"found": {**record.get("found", {}), **found}, "left out": failures}
+    write_text(out / _RECORD, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+    made = {photo.object for photo in chosen if _is_done(photo, out)}
+    return PhotosReport(out, kept, len(made), found, dict(ways), failures)
+
+
+def find_photos(source: Path) -> tuple[dict[str, list[Photo]], dict[str, str]]:
+    """The photographs below a folder by object, and why some files are none.
+
+    Raises:
+        UserError: `source` is no folder.
+    """
+    if not source.is_dir():
+        raise UserError(f"{source} is no folder; name one that holds a folder of photographs for each object")
+    by_folder: dict[Path, list[Path]] = defaultdict(list)
+    failures = {}
+    for path in sorted(source.rglob("*")):
+        inside = path.relative_to(source)
+        hidden = any(part.startswith(".") for part in inside.parts)
+        if hidden or path.parent.name in _MASK_FOLDERS or path.stem.endswith("_mask") or not path.is_file():
+            continue
+        if path.suffix.lower() in _ENDINGS:
+            by_folder[path.parent].append(path)
+        elif path.suffix.lower() in _UNREADABLE:
+            failures[str(inside)] = f"{path.suffix} pictures cannot be read; save it as JPEG or PNG"
+    found: dict[str, list[Photo]] = defaultdict(list)
+    for paths in by_folder.values():
+        stems = Counter(path.stem for path in paths)
+        for path in paths:
+            name = path.stem if stems[path.stem] == 1 else path.name.replace(".", "_")
+            title = _object_of(path, paths, source)
+            found[title].append(Photo(title, name, path, _given_mask(path)))
+    return dict(found), failures
+
+
+def _object_of(path: Path, beside: list[Path], source: Path) -> str:
+    """The object's name: its folder's, below that of Stanford Online Products the listing's number."""
+    folder = path.parent.relative_to(source)
+    numbered = [_LISTING.fullmatch(each.stem) for each in beside]
+    match = _LISTING.fullmatch(path.stem)
+    if match and (path.parent.name.endswith(_PRODUCTS) or (all(numbered) and len(beside) > 1)):
+        return str(Path(*[part.removesuffix(_PRODUCTS) for part in folder.parts], match[1]))
+    return str(folder) if folder.parts else source.resolve().name
+
+
+def _given_mask(path: Path) -> Path | None:
+    candidates = [path.with_name(f"{path.stem}_mask{ending}") for ending in _ENDINGS]
+    candidates += [
+        path.parent / name / f"{path.stem}{ending}" for name in _MASK_FOLDERS for ending in _ENDINGS
+    ]
+    return next((each for each in candidates if each.is_file()), None)
+
+
+class _Job(NamedTuple):
+    photo: Photo
+    out: Path
+    size: int
+
+
+def _target(photo: Photo, out: Path) -> Path:
+    return out / photo.object / f"{photo.name}.png"
+
+
+def _is_done(photo: Photo, out: Path) -> bool:
+    return _target(photo, out).is_file()
+
+
+def _cut_one(job: _Job) -> tuple[str, str] | Exception:
+    """Write one mask and then its picture; the way and the words of what was found."""
+    photo = job.photo
+    try:
+        made = cut_out(read_rgba(photo.path), size=job.size, given=photo.mask and read_rgba(photo.mask))
+        target = _target(photo, job.out)
+        for path, pixels in (
+            (target.parent / MASKS / target.name, made.mask.astype(np.uint8) * 255),
+            (target, made.picture),
+        ):
+            with replacing(path) as temporary:
+                Image.fromarray(pixels).save(temporary, format="PNG")
+    except UserError as error:
+        return error
+    except Exception as error:  # whatever is wrong with one photograph, the others must be made
+        return UserError(f"{type(error).__name__}: {error}")
+    return made.way, made.found
+
+
+def _read_record(out: Path) -> dict[str, dict[str, str]]:
+    try:
+        return dict(json.loads((out / _RECORD).read_text()))
+    except (OSError, ValueError):
+        return {}
