@@ -160,9 +160,13 @@ class Experiment:
     views: the error from 1 to 8 images.
     agreement: search and descent in detail: step sizes, steps, groups and restraints.
     health: which choices keep a network listening to its image.
+    front-vs-projection: free clouds moved by the front constraint and by projection losses. Besides trees, --data takes
+    meshes as `data meshes` does; --limit counts shapes of each kind, at most 3.
     """
 
-    name: Positional[Literal["deterministic", "critic", "stages", "views", "agreement", "health"]]
+    name: Positional[
+        Literal["deterministic", "critic", "stages", "views", "agreement", "health", "front-vs-projection"]
+    ]
     """Which one."""
     data: tuple[Path, ...]
     """Root of a data tree; several are put together for training, and the first one's test split is scored (health:

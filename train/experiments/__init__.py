@@ -9,12 +9,24 @@ from typing import Any
 from train.errors import UserError
 from train.experiments.agreement import agreement
 from train.experiments.critic import critic
+from train.experiments.front_vs_projection import run as front_vs_projection
 from train.experiments.health import health
 from train.experiments.paper import TABLES
 from train.experiments.table import make
 from train.experiments.workbench import Workbench
 
 __all__ = ["EXPERIMENTS", "Workbench", "run_experiment"]
+
+
+def _about_losses(bench: Workbench) -> dict[str, Any]:
+    return front_vs_projection(
+        bench.data,
+        bench.out,
+        seeds=bench.seeds,
+        limit=bench.limit,
+        iterations=bench.steps,
+        progress=bench.progress,
+    )
 
 
 def _about_a_run(bench: Workbench, run: Path | None, views: int) -> dict[str, Any]:
@@ -29,6 +41,7 @@ def _about_a_run(bench: Workbench, run: Path | None, views: int) -> dict[str, An
 _TRAINING: dict[str, Callable[[Workbench], dict[str, Any]]] = {"health": health}
 _TRAINING |= {name: lambda bench, table=table: make(table, bench) for name, table in TABLES.items()}
 _TRAINING["critic"] = critic
+_TRAINING["front-vs-projection"] = _about_losses
 
 EXPERIMENTS = ("agreement", *_TRAINING)
 """Names of all experiments."""

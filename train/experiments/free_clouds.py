@@ -1,0 +1,190 @@
+"""Free clouds: points without a network, moved down a loss between depth maps until they are the shape, or are not."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from diffpoint import chamfer_distance, front_constraint, project, projection_loss, soft_projection_loss
+from train.experiments.study_shapes import Scene
+
+MEASURED_EVERY = 10
+
+
+class Loss(NamedTuple):
+    """One way to compare a cloud with depth maps."""
+
+    title: str
+    value: Callable[[Tensor, Tensor | None, Scene, float], Tensor]
+    """Cloud (1, N, 3), logits of its points' existence, scene and progress in [0, 1] to a scalar."""
+    colour: str
+    deletes: bool = False
+    """Whether it takes logits: it may delete points."""
+
+
+class Measures(NamedTuple):
+    """How good a cloud is, whatever loss made it."""
+
+    visible_cd: float
+    """Chamfer distance x100 between what the views see of the cloud and what they see of the shape."""
+    inside: float
+    """Share of the points that project into the silhouette, over all views."""
+    pred_to_gt: float
+    """Mean distance x100 from the cloud to the whole shape."""
+    gt_to_pred: float
+    """Mean distance x100 from the whole shape to the cloud."""
+    left: float
+    """Share of the points that exist."""
+
+
+class Fit(NamedTuple):
+    """A fitted cloud and its history."""
+
+    measures: Measures
+    sideways: float
+    """|gradient in the first camera's x and y| / |gradient|, mean over the iterations."""
+    largest_sideways: float
+    """The largest |gradient in the first camera's x or y| of any point at any iteration."""
+    losses: list[float]
+    """Its own loss at every iteration."""
+    visible_cd: list[float]
+    """`Measures.visible_cd` every `MEASURED_EVERY` iterations."""
+    clouds: dict[int, Tensor]
+    """The cloud (N, 3) after some numbers of iterations."""
+    ms_per_iteration: float
+
+
+def _radius(progress: float) -> float:
+    """Of soft footprints, in pixels: large ones reach far, small ones are sharp."""
+    return 6.0 * (0.75 / 6.0) ** min(1.0, 2 * progress)
+
+
+LOSSES: dict[str, Loss] = {
+    "front": Loss("front constraint", lambda x, _, s, __: front_constraint(x, s.camera, s.depth), "#22577a"),
+    "front_emd": Loss(
+        "front constraint, EMD",
+        lambda x, _, s, __: front_constraint(x, s.camera, s.depth, distance="emd", tolerance=0.05),
+        "#57a0c9",
+    ),
+    "projection": Loss(
+        "projection loss, depth alone", lambda x, _, s, __: projection_loss(x, s.camera, s.depth), "#c8553d"
+    ),
+    "lin": Loss(
+        "projection loss of Lin et al.",
+        lambda x, e, s, __: projection_loss(x, s.camera, s.depth, logits=e, mask_weight=1.0, upsample=2),
+        "#e59866",
+        deletes=True,
+    ),
+    "soft": Loss(
+        "soft projection loss",
+        lambda x, _, s, t: soft_projection_loss(x, s.camera, s.depth, radius=_radius(t)),
+        "#6a994e",
+    ),
+}
+
+
+def fit_cloud(scene: Scene, loss: Loss, *, iterations: int, rate: float, kept: Sequence[int] = ()) -> Fit:
+    """Moves the start cloud by Adam down one loss, with a step size that falls from `rate` to 0 along a cosine.
+
+    Args:
+        scene: what is seen of a shape.
+        loss: how the cloud is compared with it.
+        iterations: steps.
+        rate: first step size, in world units (of logits, in theirs).
+        kept: numbers of iterations after which copies of the cloud are kept.
+
+    Example:
+        >>> from train.experiments.study_shapes import Cameras, embedded_shape
+        >>> scene = embedded_shape("chair").scene(Cameras(1), seed=0, points=64)
+        >>> fit_cloud(scene, LOSSES["projection"], iterations=3, rate=0.01).largest_sideways
+        0.0
+    """
+    cloud = scene.start.clone().requires_grad_()
+    logits = torch.full(cloud.shape[:2], 0.5).requires_grad_() if loss.deletes else None
+    optimiser = torch.optim.Adam([cloud] if logits is None else [cloud, logits], lr=rate)
+    clouds: dict[int, Tensor] = {}
+    losses: list[float] = []
+    sideways: list[float] = []
+    visible_cd: list[float] = []
+    largest, seconds = 0.0, 0.0
+    for iteration in range(iterations):
+        existing = _existing(cloud, logits)
+        if iteration in kept:
+            clouds[iteration] = existing[0]
+        if iteration % MEASURED_EVERY == 0:
+            visible_cd.append(visible_chamfer(scene, existing))
+        begun = time.perf_counter()
+        for group in optimiser.param_groups:
+            group["lr"] = rate * (1 + math.cos(math.pi * iteration / iterations)) / 2
+        optimiser.zero_grad()
+        value = _quietly(lambda at=iteration: loss.value(cloud, logits, scene, at / iterations))
+        value.backward()
+        optimiser.step()
+        seconds += time.perf_counter() - begun
+        losses.append(value.item())
+        assert cloud.grad is not None
+        whole = cloud.grad.norm()
+        sideways.append((cloud.grad[..., :2].norm() / whole).item() if whole > 0 else 0.0)
+        largest = max(largest, cloud.grad[..., :2].abs().max().item())
+    existing = _existing(cloud, logits)
+    if iterations in kept:
+        clouds[iterations] = existing[0]
+    return Fit(
+        measure(scene, existing),
+        sum(sideways) / len(sideways),
+        largest,
+        losses,
+        [*visible_cd, visible_chamfer(scene, existing)],
+        clouds,
+        1000 * seconds / iterations,
+    )
+
+
+def _existing(cloud: Tensor, logits: Tensor | None) -> Tensor:
+    """(1, M, 3) the points that exist; all of them if none does."""
+    cloud = cloud.detach().clone()
+    if logits is None or not bool((logits > 0).any()):
+        return cloud
+    return cloud[:, logits[0] > 0]
+
+
+def visible_chamfer(scene: Scene, cloud: Tensor) -> float:
+    """`Measures.visible_cd`: the value of the front constraint, x100, for a cloud of whatever origin."""
+    return 100 * _quietly(lambda: front_constraint(cloud, scene.camera, scene.depth)).item()
+
+
+def in_silhouette(scene: Scene, cloud: Tensor, *, margin: int = 0) -> Tensor:
+    """(V, N): does the point project into a pixel where the shape is, or `margin` pixels beside one?"""
+    silhouette = torch.isfinite(scene.depth[0]).float()
+    silhouette = F.max_pool2d(silhouette, 2 * margin + 1, 1, margin) > 0
+    pixels = project(cloud, scene.camera).pixels[0]
+    inside = ((pixels >= 0) & (pixels < scene.camera.width)).all(-1)
+    u, v = pixels.clamp(0, scene.camera.width - 1).long().unbind(-1)
+    view = torch.arange(len(pixels))[:, None]
+    return inside & silhouette[view, v, u]
+
+
+def measure(scene: Scene, cloud: Tensor) -> Measures:
+    """All measures of a cloud (1, M, 3)."""
+    whole = chamfer_distance(cloud, scene.surface, squared=False)
+    return Measures(
+        visible_cd=visible_chamfer(scene, cloud),
+        inside=in_silhouette(scene, cloud).float().mean().item(),
+        pred_to_gt=100 * whole.a_to_b.item(),
+        gt_to_pred=100 * whole.b_to_a.item(),
+        left=cloud.shape[1] / scene.start.shape[1],
+    )
+
+
+def _quietly(value: Callable[[], Tensor]) -> Tensor:
+    """Without the front constraint's warning that a view sees no point: here that is a result, not a mistake."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="front_constraint: in ", category=RuntimeWarning)
+        return value()

@@ -1,0 +1,209 @@
+"""Shapes to study losses on: embedded ones and meshes from any camera, the shapes of a data tree from their own.
+
+The frame of a scene is that of its first camera, in which the x and y of a gradient are that camera's to the last bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffpoint import PinholeCamera
+from train.data import ShapeTree, store
+from train.data.categories import category_of
+from train.data.meshes import MeshError, load_surface
+from train.data.procedural import variants_of
+from train.data.render import Renderer, orbit_camera
+from train.data.shrink import decimate_depth
+from train.data.solids import sample_union, surface_of
+from train.data.sources import MeshFile, find_meshes, read_labels, shape_ids
+from train.data.surface import sample_triangles
+from train.errors import UserError
+
+EMBEDDED = ("chair", "car", "airplane")
+SIZE = 56
+"""Pixels of a side of the depth maps, as in the paper."""
+_LABELS = Path(__file__).parents[1] / "data" / "furniture_labels.csv"
+_SURFACE = 4096
+_ELEVATION_DEG = 15.0
+_GOLDEN_DEG = 180 * (3 - 5**0.5)
+
+
+class Cameras(NamedTuple):
+    """Where the views of a scene stand."""
+
+    count: int
+    sphere: bool = False
+    """Spread over the whole sphere; otherwise equispaced on a circle, 15 degrees above the horizon."""
+
+    @property
+    def name(self) -> str:
+        where = "sphere" if self.sphere else "horizontal"
+        return f"{self.count} {where} view{'s' if self.count > 1 else ''}"
+
+    def around(self, turn_deg: float, size: int = SIZE) -> PinholeCamera:
+        """(V,) cameras at distance 2 that look at the origin, turned about the vertical."""
+        number = np.arange(self.count)
+        if self.sphere:  # Fibonacci's lattice: no camera on the poles, where "up" has no meaning
+            elevation = np.degrees(np.arcsin(1 - (2 * number + 1) / self.count))
+            return orbit_camera(turn_deg + number * _GOLDEN_DEG, elevation, size)
+        elevation = np.full(self.count, _ELEVATION_DEG)
+        return orbit_camera(turn_deg + number * 360 / self.count, elevation, size)
+
+
+class Scene(NamedTuple):
+    """What a fit is given, and what it is judged by; all in the frame of the first camera."""
+
+    camera: PinholeCamera
+    """V views."""
+    depth: Tensor
+    """(1, V, H, W) true depth maps, +inf where empty."""
+    surface: Tensor
+    """(1, 4096, 3) points of the whole shape, seen or not."""
+    start: Tensor
+    """(1, N, 3) the cloud that every fit starts from: uniform in a cube of side 1 around the shape."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyShape:
+    """A shape that can be seen from `cameras`.
+
+    Attributes:
+        name: unique in a study, and safe as a file's name.
+        source: where it comes from, for the reader of a table.
+        see: cameras and a turn in degrees to (camera (V,), depth (V, H, W)), world frame; None where the shape cannot
+            be seen from there.
+        surface: (4096, 3) points, world frame.
+    """
+
+    name: str
+    source: str
+    see: Callable[[Cameras, float], tuple[PinholeCamera, Tensor] | None]
+    surface: Tensor
+
+    def scene(self, cameras: Cameras, *, seed: int, points: int = 1024) -> Scene | None:
+        """The views, turned at random, and a random cloud to start from; None where there are no such views."""
+        random = np.random.default_rng(seed)
+        seen = self.see(cameras, float(random.uniform(0, 360)))
+        if seen is None:
+            return None
+        camera, depth = seen
+        start = torch.from_numpy(random.uniform(-0.5, 0.5, (points, 3))).float()
+        first_from_world = camera.cam_from_world[0].double()
+        cam_from_first = (camera.cam_from_world.double() @ torch.linalg.inv(first_from_world)).float()
+        cam_from_first[0] = torch.eye(4)
+
+        def moved(cloud: Tensor) -> Tensor:
+            return (cloud.double() @ first_from_world[:3, :3].T + first_from_world[:3, 3]).float()[None]
+
+        frame = PinholeCamera(camera.K.float(), cam_from_first, camera.height, camera.width)
+        return Scene(frame, depth[None].float(), moved(self.surface), moved(start))
+
+
+def embedded_shape(category: str, seed: int = 0) -> StudyShape:
+    """A shape of an embedded family.
+
+    Example:
+        >>> scene = embedded_shape("chair").scene(Cameras(2), seed=0, points=100)
+        >>> scene.depth.shape, scene.start.shape
+        (torch.Size([1, 2, 56, 56]), torch.Size([1, 100, 3]))
+    """
+    solids = variants_of(category, seed)[0]
+    surface = sample_union(solids, _SURFACE, np.random.default_rng(seed))
+    return _rendered(f"embedded_{category}", "embedded", Renderer(surface_of(solids)), surface)
+
+
+def _rendered(name: str, source: str, renderer: Renderer, surface: np.ndarray) -> StudyShape:
+    def see(cameras: Cameras, turn_deg: float) -> tuple[PinholeCamera, Tensor]:
+        views = renderer.render(cameras.around(turn_deg))
+        return views.camera, torch.from_numpy(views.depth)
+
+    return StudyShape(name, source, see, torch.from_numpy(surface).float())
+
+
+def shapes_of(data: Sequence[Path], *, limit: int) -> list[StudyShape]:
+    """Shapes from data trees and from sources of meshes, at most `limit` of each tree and of all meshes together.
+
+    Args:
+        data: data trees, whose test shapes are seen from their own views only, and what the `data meshes` command
+            takes: folders, archives and files of meshes, seen from everywhere.
+        limit: how many; different categories first.
+
+    Raises:
+        UserError: a path that is neither, or nothing usable in it.
+    """
+    trees = [path for path in data if (path / store.RENDERS).is_dir()]
+    sources = [path for path in data if path not in trees]
+    shapes = [shape for tree in trees for shape in _of_tree(tree, limit)]
+    if sources:
+        shapes += _of_meshes(sources, limit)
+    return shapes
+
+
+def _of_meshes(sources: Sequence[Path], limit: int) -> list[StudyShape]:
+    labels = {(label.library, label.model): label for label in read_labels(_LABELS)}
+    with tempfile.TemporaryDirectory(prefix="meshes-") as scratch:
+        meshes, _ = find_meshes(list(sources), Path(scratch))
+
+        def category(mesh: MeshFile) -> str:
+            label = labels.get((mesh.library, mesh.inside))
+            return category_of(label.synset if label else mesh.synset)
+
+        # The labelled ones of an archive of furniture first: the rest of it is plants, lights and window frames.
+        known = [mesh for mesh in meshes if (mesh.library, mesh.inside) in labels] or meshes
+        names = dict(zip(known, shape_ids(known), strict=True))
+        shapes: list[StudyShape] = []
+        for mesh in _varied(known, [category(mesh) for mesh in known]):
+            if len(shapes) == limit:
+                break
+            try:
+                surface = load_surface(mesh.path, mesh.rotation)
+            except MeshError:
+                continue
+            corners = surface.vertices[surface.faces]
+            points, _ = sample_triangles(corners, _SURFACE, np.random.default_rng(0))
+            name = f"{category(mesh)}_{names[mesh].split('/')[-1]}"
+            shapes.append(_rendered(name, mesh.library, Renderer(surface), points))
+    if not shapes:
+        raise UserError(f"no usable mesh in {', '.join(map(str, sources))}")
+    return shapes
+
+
+def _of_tree(tree: Path, limit: int) -> list[StudyShape]:
+    split = ShapeTree(tree, "test")
+    order = _varied(range(len(split)), [shape.split("/")[0] for shape in split.ids])
+    return [_own_views(split, number, tree) for number in order[:limit]]
+
+
+def _own_views(split: ShapeTree, number: int, tree: Path) -> StudyShape:
+    shape = split[number]
+
+    def see(cameras: Cameras, turn_deg: float) -> tuple[PinholeCamera, Tensor] | None:
+        views = len(shape.depth)
+        if cameras.sphere or views % cameras.count or shape.depth.shape[-1] % SIZE:
+            return None
+        first = int(turn_deg / 360 * views)
+        chosen = [(first + k * views // cameras.count) % views for k in range(cameras.count)]
+        depth, camera = decimate_depth(shape.depth, shape.camera, size=SIZE)
+        return camera[torch.tensor(chosen)], depth[chosen]
+
+    return StudyShape(f"{shape.category}_{shape.id.split('/')[-1]}", tree.name, see, shape.points)
+
+
+def _varied(items: Sequence, kinds: Sequence[str]) -> list:
+    """The first of every kind, then the second of every kind, and so on; the largest kinds first."""
+    size = Counter(kinds)
+    rank: Counter[str] = Counter()
+    order = []
+    for number, kind in enumerate(kinds):
+        order.append((rank[kind], -size[kind], kind, number))
+        rank[kind] += 1
+    return [items[number] for *_, number in sorted(order)]
