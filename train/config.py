@@ -286,10 +286,11 @@ PROFILES: dict[str, FitConfig] = {
     ),
     # The paper's 30 steps of 0.5 make the views of a network this small agree at the expense of coverage: CD + 0.29,
     # FPS-CD - 0.05 against random codes at 8 views. 10 of 0.1: + 0.02 and - 0.11, on other shapes + 0.08
-    # and - 0.05 (docs/results.md). Of two images' codes a pair's gradient is four times as long, and one shape in 264 got
-    # worse in the end: the best codes on the way are kept.
+    # and - 0.05 (docs/results.md). With two images a pair's gradient is four times as long as with eight, and one shape
+    # in 264 got worse in the end: the best codes on the way are kept.
     "cpu": FitConfig(
-        _CPU_STAGE1, _CPU_STAGE2, _CPU_PRETRAIN, "cpu", inference=InferenceConfig(steps=10, step_size=0.1, keep_best=True)
+        _CPU_STAGE1, _CPU_STAGE2, _CPU_PRETRAIN, "cpu",
+        inference=InferenceConfig(steps=10, step_size=0.1, keep_best=True),
     ),
     "smoke": FitConfig(
         _SMOKE_STAGE1, _SMOKE_STAGE2, _SMOKE_PRETRAIN, "smoke", map_size=16,
