@@ -86,7 +86,7 @@ def agreement(
     """
     opened = open_run(run)
     model, config = opened.model, opened.config
-    if model.config.deterministic:
+    if not isinstance(model, Generator) or model.config.deterministic:
         raise UserError(f"{run} takes no codes: there is nothing to agree on by choosing them")
     test = opened.load_split(data, "test", limit=limit, progress=progress)
     if not 2 <= views <= test.views:

@@ -210,7 +210,7 @@ def _markdown(result: Mapping[str, Any]) -> str:
 def _figure(result: Mapping[str, Any]) -> Figure:
     """How far predictions move with the image, over the steps: a panel for each tree, a line for each training."""
     trees = result["curves"]
-    figure = Figure(figsize=(6.5 * len(trees), 4.4), layout="constrained", dpi=110)
+    figure = Figure(figsize=(6.5 * len(trees) + 2, 4.4), layout="constrained", dpi=110)
     panels = figure.subplots(1, len(trees), squeeze=False)[0]
     colours = ("#1f6f8b", "#c8553d", "#8a6d9e", "#dd9f63", "#5a9367", "#6b7785")
     for axes, (tree, rows) in zip(panels, trees.items(), strict=True):
@@ -230,6 +230,9 @@ def _figure(result: Mapping[str, Any]) -> Figure:
             ylabel="predictions of different images differ by (CD x100)",
         )  # fmt: skip
         axes.set_yscale("symlog", linthresh=0.1)
-        axes.legend(fontsize=8)
+        axes.set_ylim(-0.01, None)
+        axes.spines[["top", "right"]].set_visible(False)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", fontsize=9, frameon=False)
     figure.suptitle(f"{result['seeds']} seeds of each, profile {result['profile']}", fontsize=11)
     return figure

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from train.batches import LoadedSplit
-from train.checkpoint import best_weights, load_generator
+from train.checkpoint import best_weights, load_predictor
 from train.config import PROFILES, FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
 from train.errors import UserError
 from train.files import replacing, write_text
@@ -122,7 +122,8 @@ class Workbench:
         data = self._data(config, split)
 
         def take() -> Scores:
-            model = load_generator(best_weights(run, stage))
+            has_stage = f"stage{stage}" in config.phases  # a method of one phase has no second
+            model = load_predictor(best_weights(run, stage) if has_stage else run)
             found = score(model, data, settings, views=views, seed=config.seed)
             return {name: values.double() for name, values in found.items()}
 
@@ -138,7 +139,7 @@ class Workbench:
 
         def take() -> Scores:
             train = self._data(config, "train")
-            points = load_generator(best_weights(self.train(config), 2)).points
+            points = load_predictor(self.train(config)).points
             if answer == "medoid":
                 clouds = train.points[medoid(train.points)].expand_as(test.points)
             else:
@@ -151,7 +152,7 @@ class Workbench:
 
     def _data(self, config: FitConfig, split: Literal["train", "val", "test"]) -> LoadedSplit:
         """A split of the first tree as a configuration reads it."""
-        model = load_generator(best_weights(self.train(config), 2))
+        model = load_predictor(self.train(config))
         sizes = (model.config.image_height, model.config.image_width, config.map_size, config.gt_pool)
         key = (split, *sizes, config.categories)
         if key not in self._loaded:
