@@ -24,8 +24,8 @@ from models.baselines.voxels import cell_centres, surface_points
 _THRESHOLD = 0.5
 _RAY_SAMPLES = 32
 _GRID_SIZE = 32
-# World units, and half a cell more: an object has a diagonal of one. Cells beyond it, into which not every camera looks,
-# would never be emptied.
+# World units, and half a cell more: an object has a diagonal of one. Cells beyond it, into which not every camera
+# looks, would never be emptied.
 _OBJECT_RADIUS = 0.5 + 0.5 / _GRID_SIZE
 # The cube [-0.5, 0.5]^3 seen from any side lies within this distance of the origin's depth.
 _HALF_DIAGONAL = math.sqrt(3) / 2
