@@ -68,8 +68,8 @@ class Generator(nn.Module):
 
     code_dim = CODE_DIM
     computes_in: torch.dtype = torch.float32
-    """torch.bfloat16 computes all layers but the last in half the precision: about twice as fast where the processor can
-    multiply such numbers (avx512_bf16, amx), slower elsewhere. Weights and points stay float32."""
+    """torch.bfloat16 computes all layers but the last in half the precision: about twice as fast where the processor
+    can multiply such numbers (avx512_bf16, amx), slower elsewhere. Weights and points stay float32."""
 
     def __init__(self, config: GeneratorConfig) -> None:
         super().__init__()
