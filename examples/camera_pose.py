@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from front_vs_projection import RADIUS, SHAPES, box_depth, sample_boxes
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -37,6 +36,25 @@ FOCAL_PX = 105.0
 REACH = 0.2  # depth differences beyond it say "another surface" rather than "not there yet"
 PRINTED_EVERY = 50
 COLOURS = {"key points": "#2a9d8f", "depth map, views": "#c8553d", "depth map, cloud": "#22577a"}
+
+# Boxes as (x0, y0, z0, x1, y1, z1); y is up. Scaled to RADIUS, so that every view holds the whole shape.
+RADIUS = 0.5
+SHAPES = {
+    "chair": [
+        (-0.25, -0.02, -0.25, 0.25, 0.04, 0.25), (-0.25, 0.04, -0.25, 0.25, 0.50, -0.19),
+        (-0.25, -0.50, -0.25, -0.19, -0.02, -0.19), (0.19, -0.50, -0.25, 0.25, -0.02, -0.19),
+        (-0.25, -0.50, 0.19, -0.19, -0.02, 0.25), (0.19, -0.50, 0.19, 0.25, -0.02, 0.25),
+    ],
+    "table": [
+        (-0.50, 0.22, -0.30, 0.50, 0.28, 0.30),
+        (-0.46, -0.28, -0.26, -0.38, 0.22, -0.18), (0.38, -0.28, -0.26, 0.46, 0.22, -0.18),
+        (-0.46, -0.28, 0.18, -0.38, 0.22, 0.26), (0.38, -0.28, 0.18, 0.46, 0.22, 0.26),
+    ],
+    "sofa": [
+        (-0.50, -0.22, -0.22, 0.50, 0.00, 0.22), (-0.50, 0.00, -0.22, 0.50, 0.24, -0.10),
+        (-0.50, 0.00, -0.10, -0.38, 0.12, 0.22), (0.38, 0.00, -0.10, 0.50, 0.12, 0.22),
+    ],
+}  # fmt: skip
 
 
 class Scene(NamedTuple):
@@ -104,6 +122,31 @@ def make_scene(shape: str = "chair", *, angle_deg: float = 20.0, distance: float
         known_depth=depth[:, 1:],
         start_from_world=cameras[0].cam_from_world @ wrong,
     )
+
+
+def box_depth(corners: Tensor, camera: PinholeCamera) -> Tensor:
+    """(V, H, W) exact depth of boxes (K, 6) at the pixels' centres, by intersecting rays with slabs."""
+    v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    pixels = torch.stack((u + 0.5, v + 0.5, torch.ones_like(u)), -1)
+    rays = torch.einsum("vij,hwj->vhwi", camera.back_projection[..., :3], pixels)[..., None, :]
+    origins = camera.position[:, None, None, None]
+    planes = torch.stack(((corners[:, :3] - origins) / rays, (corners[:, 3:] - origins) / rays))
+    enter, leave = planes.amin(0).amax(-1), planes.amax(0).amin(-1)
+    return torch.where(enter <= leave, enter, torch.inf).amin(-1)
+
+
+def sample_boxes(corners: Tensor, count: int, random: torch.Generator) -> Tensor:
+    """(count, 3) points spread evenly over the outside of boxes (K, 6)."""
+    low, high = corners[:, :3], corners[:, 3:]
+    extent = high - low
+    areas = extent.prod(-1, keepdim=True) / extent  # of the faces across x, y and z
+    face = torch.multinomial(areas.flatten(), 4 * count, replacement=True, generator=random)
+    box, axis = face // 3, face % 3
+    at = torch.rand(4 * count, 3, generator=random)
+    at[torch.arange(4 * count), axis] = at[torch.arange(4 * count), axis].round()
+    points = low[box] + at * extent[box]
+    buried = ((points[:, None] > low) & (points[:, None] < high)).all(-1).any(-1)
+    return points[~buried][:count]
 
 
 def rigid_motion(twist: Tensor) -> Tensor:

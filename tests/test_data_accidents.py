@@ -24,9 +24,9 @@ def command(source, out, processes):
     return [sys.executable, "-m", "train", *map(str, words)]
 
 
-def save_boxes(folder):
+def save_boxes(folder, count=BOXES):
     folder.mkdir()
-    for number in range(BOXES):
+    for number in range(count):
         trimesh.creation.box((1, 1 + number / 10, 2)).export(folder / f"box {number:02d}.ply")
 
 
@@ -73,7 +73,7 @@ def test_a_killed_run_leaves_no_process_and_is_finished_by_the_next(tmp_path):
 
 def test_an_interrupted_run_ends_at_once_with_one_word(tmp_path):
     """Also its workers, which a terminal interrupts as well, while they are still starting."""
-    save_boxes(tmp_path / "in")
+    save_boxes(tmp_path / "in", 300)  # enough to be at work still on a machine that has other work to do
     run = subprocess.Popen(
         command(tmp_path / "in", tmp_path / "out", 2),
         start_new_session=True,
