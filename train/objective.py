@@ -14,6 +14,10 @@ from train.config import StageConfig
 # weights of the other terms belong to maps of 56 x 56.
 _PAPER_MAP_SIZE = 56
 
+# How far above the least the diversity loss may take a transport, where it has to know it at all. It is 2 % above in
+# the mean then, a third faster than at 0.05, and the approximation of the paper's own code is 30 % above.
+_SPREAD_TOLERANCE = 0.2
+
 # A transport between the joined clouds of many views would take most of a step.
 _JOINED_POINTS = 512
 
@@ -122,4 +126,9 @@ def spread_loss(codes: Tensor, clouds: Tensor, stage: StageConfig, *, views: int
         # Spread over the batch, so that several processes with a part each take the images that one would take.
         every = max(1, stage.shapes * stage.views // stage.diversity_images)
     thin = slice(step % stride, None, stride)
-    return diversity_loss(codes[:, ::every], clouds[:, ::every, thin], alpha=stage.exact_alpha)
+    return diversity_loss(
+        codes[:, ::every],
+        clouds[:, ::every, thin],
+        alpha=stage.exact_alpha,
+        tolerance=_SPREAD_TOLERANCE,
+    )
