@@ -155,11 +155,17 @@ class Experiment:
     Trains what it needs, once for all experiments that write to the same place, and goes on where it was stopped.
 
     deterministic: our system beside its counterpart without codes.
+
     critic: with the latent critic and without.
+
     stages: what stage 2, search and descent add.
+
     views: the error from 1 to 8 images.
+
     agreement: search and descent in detail: step sizes, steps, groups and restraints.
+
     health: which choices keep a network listening to its image.
+
     front-vs-projection: free clouds moved by the front constraint and by projection losses. Besides trees, --data takes
     meshes as `data meshes` does; --limit counts shapes of each kind, at most 3.
     """
