@@ -122,7 +122,7 @@ def test_agrees_with_its_twin_or_refuses(name, record_property):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHECKS)
 def test_agrees_with_its_twin_or_refuses_at_length(name, record_property):
-    outcomes = throw_at(name, largest=3000, examples=EXAMPLES)
+    outcomes = throw_at(name, largest=3000, examples=2 * EXAMPLES)
     record_property("cases", outcomes.total())
     assert outcomes[AGREED] >= 30
     assert outcomes[REFUSED] >= 3
