@@ -37,24 +37,13 @@ REACH = 0.2  # depth differences beyond it say "another surface" rather than "no
 PRINTED_EVERY = 50
 COLOURS = {"key points": "#2a9d8f", "depth map, views": "#c8553d", "depth map, cloud": "#22577a"}
 
-# Boxes as (x0, y0, z0, x1, y1, z1); y is up. Scaled to RADIUS, so that every view holds the whole shape.
+# A chair of boxes (x0, y0, z0, x1, y1, z1); y is up. Scaled to RADIUS, so that every view holds all of it.
 RADIUS = 0.5
-SHAPES = {
-    "chair": [
-        (-0.25, -0.02, -0.25, 0.25, 0.04, 0.25), (-0.25, 0.04, -0.25, 0.25, 0.50, -0.19),
-        (-0.25, -0.50, -0.25, -0.19, -0.02, -0.19), (0.19, -0.50, -0.25, 0.25, -0.02, -0.19),
-        (-0.25, -0.50, 0.19, -0.19, -0.02, 0.25), (0.19, -0.50, 0.19, 0.25, -0.02, 0.25),
-    ],
-    "table": [
-        (-0.50, 0.22, -0.30, 0.50, 0.28, 0.30),
-        (-0.46, -0.28, -0.26, -0.38, 0.22, -0.18), (0.38, -0.28, -0.26, 0.46, 0.22, -0.18),
-        (-0.46, -0.28, 0.18, -0.38, 0.22, 0.26), (0.38, -0.28, 0.18, 0.46, 0.22, 0.26),
-    ],
-    "sofa": [
-        (-0.50, -0.22, -0.22, 0.50, 0.00, 0.22), (-0.50, 0.00, -0.22, 0.50, 0.24, -0.10),
-        (-0.50, 0.00, -0.10, -0.38, 0.12, 0.22), (0.38, 0.00, -0.10, 0.50, 0.12, 0.22),
-    ],
-}  # fmt: skip
+CHAIR = [
+    (-0.25, -0.02, -0.25, 0.25, 0.04, 0.25), (-0.25, 0.04, -0.25, 0.25, 0.50, -0.19),
+    (-0.25, -0.50, -0.25, -0.19, -0.02, -0.19), (0.19, -0.50, -0.25, 0.25, -0.02, -0.19),
+    (-0.25, -0.50, 0.19, -0.19, -0.02, 0.25), (0.19, -0.50, 0.19, 0.25, -0.02, 0.25),
+]  # fmt: skip
 
 
 class Scene(NamedTuple):
@@ -95,9 +84,9 @@ class Fit(NamedTuple):
     seconds: float
 
 
-def make_scene(shape: str = "chair", *, angle_deg: float = 20.0, distance: float = 0.15) -> Scene:
-    """Boxes, four exact depth maps, and a first guess that is `angle_deg` and `distance` off."""
-    corners = torch.tensor(SHAPES[shape])
+def make_scene(*, angle_deg: float = 20.0, distance: float = 0.15) -> Scene:
+    """A chair, four exact depth maps, and a first guess that is `angle_deg` and `distance` off."""
+    corners = torch.tensor(CHAIR)
     corners = corners * RADIUS / corners.unflatten(-1, (2, 3)).norm(dim=-1).max()
     azimuth = torch.deg2rad(35 + torch.tensor([0.0, -40.0, 10.0, 45.0]))
     elevation = torch.deg2rad(torch.tensor([20.0, 15.0, 40.0, 25.0]))
