@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from train.batches import LoadedSplit, load_split
+from train.batches import LoadedSplit
 from train.checkpoint import best_weights, latest_checkpoint, load_autoencoder, save_checkpoint, save_weights
 from train.config import FitConfig, fit_config_from_json, to_json
 from train.data.tree import require_depth
@@ -26,6 +26,7 @@ from train.interrupts import StopRequest
 from train.log import RunLog
 from train.parallel import World, gather
 from train.pictures import draw_predictions
+from train.runs import read_split
 from train.state import Training
 from train.systems import image_size
 
@@ -69,15 +70,7 @@ def fit(
     progress = progress and world.writes
     _check_run_directory(out, config, resume=resume)
     require_depth([data] if isinstance(data, Path) else data)
-    read = functools.partial(
-        load_split,
-        data,
-        image_size=image_size(config),
-        map_size=config.map_size,
-        gt_pool=config.gt_pool,
-        categories=config.categories,
-        progress=progress,
-    )
+    read = functools.partial(read_split, config, data, image_size=image_size(config), progress=progress)
     train, val = read("train"), read("val", limit=config.validation_shapes)
     _check_fits(config, train, world)
     world.wait()  # all have looked at the directory before one writes into it

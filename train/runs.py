@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -35,16 +36,30 @@ class OpenRun(NamedTuple):
         progress: bool = True,
     ) -> LoadedSplit:
         """Reads a split as the run was trained: its image and map sizes, its categories."""
-        return load_split(
-            data,
-            split,
-            image_size=(self.model.config.image_height, self.model.config.image_width),
-            map_size=self.config.map_size,
-            gt_pool=self.config.gt_pool,
-            categories=self.config.categories,
-            limit=limit,
-            progress=progress,
-        )
+        size = (self.model.config.image_height, self.model.config.image_width)
+        return read_split(self.config, data, split, image_size=size, limit=limit, progress=progress)
+
+
+def read_split(
+    config: FitConfig,
+    data: Path | Sequence[Path],
+    split: Literal["train", "val", "test"],
+    *,
+    image_size: tuple[int, int],
+    limit: int | None = None,
+    progress: bool = True,
+) -> LoadedSplit:
+    """Reads a split as a configuration asks for it: its map size and pooling, its categories; see `load_split`."""
+    return load_split(
+        data,
+        split,
+        image_size=image_size,
+        map_size=config.map_size,
+        gt_pool=config.gt_pool,
+        categories=config.categories,
+        limit=limit,
+        progress=progress,
+    )
 
 
 def open_run(run: Path) -> OpenRun:

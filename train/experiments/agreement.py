@@ -27,6 +27,7 @@ from train import figures
 from train.batches import LoadedSplit
 from train.config import InferenceConfig
 from train.errors import UserError
+from train.experiments.table import table_row
 from train.files import write_text
 from train.runs import open_run
 from train.scoring import Scores, means, score, spreads, stacked
@@ -195,19 +196,21 @@ def _correlation(groups: Scores) -> dict[str, dict[str, float]]:
 
 def _markdown(result: dict[str, Any]) -> str:
     header = ["codes", *_COLUMNS.values(), "CD - random", "FPS-CD - random", "lowered"]
-    lines = [_row(header), _row(["---", *["---:"] * (len(header) - 1)])]
+    lines = [table_row(header), table_row(["---", *["---:"] * (len(header) - 1)])]
     for name, way in result["ways"].items():
         cells = [f"{way['mean'][column]:.2f}" for column in _COLUMNS]
         for column in ("cd", "fps_cd"):
             change = way["against_random"][column]
             cells.append("" if name == _RANDOM else f"{change['mean']:+.3f} ± {change['standard_error']:.3f}")
         lowered = way["lowered_share"]
-        lines.append(_row([name, *cells, "" if lowered is None else f"{lowered:.1%}"]))
+        lines.append(table_row([name, *cells, "" if lowered is None else f"{lowered:.1%}"]))
     correlations = [
-        _row(["correlation of disagreement with", "over groups of codes, within a shape", "over shapes"]),
-        _row(["---", "---:", "---:"]),
+        table_row(
+            ["correlation of disagreement with", "over groups of codes, within a shape", "over shapes"]
+        ),
+        table_row(["---", "---:", "---:"]),
         *(
-            _row([_COLUMNS[name], f"{r['within_shapes']:+.2f}", f"{r['across_shapes']:+.2f}"])
+            table_row([_COLUMNS[name], f"{r['within_shapes']:+.2f}", f"{r['across_shapes']:+.2f}"])
             for name, r in result["correlation"].items()
         ),
     ]
@@ -220,10 +223,6 @@ def _markdown(result: dict[str, Any]) -> str:
         f"prediction, disagree by {result['floor']:.2f}."
     )
     return "\n".join([head, "", *lines, "", *correlations, ""])
-
-
-def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 def _figure(result: dict[str, Any], groups: Scores) -> Figure:

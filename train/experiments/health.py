@@ -19,18 +19,19 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from models import PROFILES as SIZES
 from models import Generator
 from models.parts import IMAGE_GAIN, IMAGE_MEAN
 from train import figures
-from train.batches import LoadedSplit, load_split
+from train.batches import LoadedSplit
 from train.config import PROFILES, FitConfig, StageConfig
 from train.errors import UserError
 from train.experiments.paper import without_critic
 from train.experiments.workbench import Workbench
 from train.files import write_text
 from train.health import sensitivity
+from train.runs import read_split
 from train.state import Training
+from train.systems import image_size
 from train.validation import validate
 
 STEPS = 500
@@ -139,12 +140,9 @@ def _curve(
 
 
 def _read(bench: Workbench, root: Path, config: FitConfig) -> tuple[LoadedSplit, LoadedSplit]:
-    size = SIZES[bench.profile]
-    options = {
-        "image_size": (size.image_height, size.image_width), "map_size": config.map_size, "progress": False
-    }  # fmt: skip
-    val = load_split(root, "val", limit=config.validation_shapes, **options)
-    return load_split(root, "train", **options), val
+    size = image_size(config)
+    val = read_split(config, root, "val", image_size=size, limit=config.validation_shapes, progress=False)
+    return read_split(config, root, "train", image_size=size, progress=False), val
 
 
 def _train(

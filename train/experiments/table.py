@@ -198,16 +198,21 @@ def markdown(result: Mapping[str, Any], columns: Sequence[str]) -> str:
         f"{result['title']} {result['shapes']} held-out shapes, profile `{result['profile']}`, {seeds} {plural} of "
         "each; un-squared distances x100, mean ± standard deviation over trainings. In brackets: the paper."
     )
-    lines = [head, "", _line(["", *(NAMES[c] for c in columns)]), _line(["---", *["---:"] * len(columns)])]
+    lines = [
+        head,
+        "",
+        table_row(["", *(NAMES[c] for c in columns)]),
+        table_row(["---", *["---:"] * len(columns)]),
+    ]
     for name, row in result["rows"].items():
-        lines.append(_line([name, *(_cell(row, column) for column in columns)]))
+        lines.append(table_row([name, *(_cell(row, column) for column in columns)]))
     if result["expectations"]:
-        lines += ["", _line(["expected", "gain", "paper's", "confidence", ""])]
-        lines.append(_line(["---", "---:", "---:", "---:", "---"]))
+        lines += ["", table_row(["expected", "gain", "paper's", "confidence", ""])]
+        lines.append(table_row(["---", "---:", "---:", "---:", "---"]))
     for e in result["expectations"]:
         claim = f"{NAMES[e['figure']]}: {e['lower']} < {e['higher']}"
         paper = "" if e["paper_gain"] is None else f"{e['paper_gain']:+.2f}"
-        lines.append(_line([claim, f"{e['gain']:+.2f}", paper, f"{e['confidence']:.1%}", e["verdict"]]))
+        lines.append(table_row([claim, f"{e['gain']:+.2f}", paper, f"{e['confidence']:.1%}", e["verdict"]]))
     agreed = {name: row["consistency"] for name, row in result["rows"].items() if "consistency" in row}
     if agreed:
         lines += [
@@ -229,7 +234,8 @@ def _cell(row: Mapping[str, Any], column: str) -> str:
     return text if paper is None else f"{text} ({paper:.2f})"
 
 
-def _line(cells: Sequence[str]) -> str:
+def table_row(cells: Sequence[str]) -> str:
+    """A line of a Markdown table."""
     return f"| {' | '.join(cells)} |"
 
 

@@ -25,8 +25,9 @@ from train.config import PROFILES, FitConfig, InferenceConfig, Profile, fit_conf
 from train.errors import UserError
 from train.files import replacing, write_text
 from train.fit import fit
-from train.runs import OpenRun
+from train.runs import read_split
 from train.scoring import Scores, compare, score
+from train.systems import image_size
 from train.trivial import medoid, nearest_by_image
 
 # What does not change a run's weights, and so not its name.
@@ -152,13 +153,13 @@ class Workbench:
 
     def _data(self, config: FitConfig, split: Literal["train", "val", "test"]) -> LoadedSplit:
         """A split of the first tree as a configuration reads it."""
-        model = load_predictor(self.train(config))
-        sizes = (model.config.image_height, model.config.image_width, config.map_size, config.gt_pool)
-        key = (split, *sizes, config.categories)
+        size = image_size(config)
+        key = (split, *size, config.map_size, config.gt_pool, config.categories)
         if key not in self._loaded:
             limit = self.limit if split != "train" else None
-            opened = OpenRun(model, config, None)
-            self._loaded[key] = opened.load_split(self.data[0], split, limit=limit, progress=self.progress)
+            self._loaded[key] = read_split(
+                config, self.data[0], split, image_size=size, limit=limit, progress=self.progress
+            )
         return self._loaded[key]
 
     def _kept(self, key: Sequence[object], take: Callable[[], Scores]) -> Scores:
