@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 @contextmanager
@@ -29,6 +31,17 @@ def write_text(target: Path, text: str) -> None:
     """Writes a text file atomically."""
     with replacing(target) as temporary:
         temporary.write_text(text)
+
+
+def kept(path: Path, key: Any, make: Callable[[], Any]) -> Any:
+    """What was kept at `path` under the same key; else made now, and kept. Both are plain JSON values."""
+    if path.exists():
+        saved = json.loads(path.read_text())
+        if saved["key"] == key:
+            return saved["result"]
+    result = make()
+    write_text(path, json.dumps({"key": key, "result": result}) + "\n")
+    return result
 
 
 def remove(path: Path) -> None:

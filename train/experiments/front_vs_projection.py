@@ -28,7 +28,7 @@ from train.experiments.study_shapes import (
     embedded_shape,
     shapes_of,
 )
-from train.files import write_text
+from train.files import kept, write_text
 
 SETTINGS = tuple(Cameras(n) for n in (1, 2, 4, 8)) + tuple(Cameras(n, sphere=True) for n in (8, 24))
 RATES = (0.003, 0.01, 0.03)
@@ -163,14 +163,11 @@ class _Study:
         """A finished fit is read, if it is of the same scene and settings; others are made."""
         assert scene is not None
         key = {"iterations": self.iterations, "rate": rate, "scene": _digest(scene)}
-        path = self.folder / cell.file
-        if path.exists():
-            kept = json.loads(path.read_text())
-            if kept["key"] == key:
-                return kept["result"]
-        result = _record(fit_cloud(scene, LOSSES[cell.loss], iterations=self.iterations, rate=rate))
-        write_text(path, json.dumps({"key": key, "result": result}) + "\n")
-        return result
+
+        def fit() -> dict[str, Any]:
+            return _record(fit_cloud(scene, LOSSES[cell.loss], iterations=self.iterations, rate=rate))
+
+        return kept(self.folder / cell.file, key, fit)
 
 
 def takes_part(loss: str, cameras: Cameras) -> bool:

@@ -27,7 +27,7 @@ from train.config import PROFILES, FitConfig, StageConfig
 from train.errors import UserError
 from train.experiments.paper import without_critic
 from train.experiments.workbench import Workbench
-from train.files import write_text
+from train.files import kept, write_text
 from train.health import sensitivity
 from train.runs import read_split
 from train.state import Training
@@ -124,22 +124,24 @@ def _curve(
     splits: list[LoadedSplit],
 ) -> list[dict[str, float]]:
     """The measurements of one training, taken now or read; `splits` holds the tree once it has been needed."""
-    kept = bench.out / "health" / f"{root.name}-{name.replace(' ', '-')}-{steps}-seed{seed}.json"
-    if kept.exists():
-        return json.loads(kept.read_text())
     base = bench.config(without_critic, seed=seed)
     stage = base.stage1.lasting(steps)
     for change in variant.stage:
         stage = change(stage)
     config = dataclasses.replace(base, stage1=stage)
-    if not splits:
-        splits += _read(bench, root, config)
-    found = _train(config, variant, *splits)
-    write_text(kept, json.dumps(found) + "\n")
-    return found
+
+    def train() -> list[dict[str, float]]:
+        if not splits:
+            splits.extend(_read(root, config))
+        return _train(config, variant, *splits)
+
+    # The name is for people; what the measurements belong to is the configuration and the tree.
+    key = [name, dataclasses.replace(bench, data=(root,)).run_of(config).name]
+    path = bench.out / "health" / f"{root.name}-{name.replace(' ', '-')}-{steps}-seed{seed}.json"
+    return kept(path, key, train)
 
 
-def _read(bench: Workbench, root: Path, config: FitConfig) -> tuple[LoadedSplit, LoadedSplit]:
+def _read(root: Path, config: FitConfig) -> tuple[LoadedSplit, LoadedSplit]:
     size = image_size(config)
     val = read_split(config, root, "val", image_size=size, limit=config.validation_shapes, progress=False)
     return read_split(config, root, "train", image_size=size, progress=False), val

@@ -1,7 +1,7 @@
 """What experiments share: runs that are trained once and scores that are taken once, whoever asks for them.
 
-    OUT/runs/KEY-seed0/    a run of `fit`; KEY comes from its configuration and its data. `trained.json` says it is done
-    OUT/scores/KEY.npz     one network on one split, with one choice of views and codes
+    OUT/runs/KEY-seed0/           a run of `fit`; KEY is of its configuration and its data. `trained.json`: it is done
+    OUT/scores/KEY.safetensors    one network on one split, with one choice of views and codes
 
 An experiment that is stopped goes on where it was when it is called again: `fit` resumes, finished scores are read.
 """
@@ -16,8 +16,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
+from safetensors.torch import load, save
 
 from train.batches import LoadedSplit
 from train.checkpoint import best_weights, load_predictor
@@ -163,13 +163,12 @@ class Workbench:
         return self._loaded[key]
 
     def _kept(self, key: Sequence[object], take: Callable[[], Scores]) -> Scores:
-        path = self.out / "scores" / f"{_digest(json.dumps(key, sort_keys=True))}.npz"
+        path = self.out / "scores" / f"{_digest(json.dumps(key, sort_keys=True))}.safetensors"
         if not path.exists():
             found = take()
-            with replacing(path) as temporary, temporary.open("wb") as file:
-                np.savez(file, allow_pickle=False, **{name: v.numpy() for name, v in found.items()})
-        with np.load(path) as file:
-            return {name: torch.from_numpy(file[name]) for name in file.files}
+            with replacing(path) as temporary:
+                temporary.write_bytes(save(found))
+        return load(path.read_bytes())
 
 
 def _digest(text: str) -> str:
