@@ -164,6 +164,12 @@ class Experiment:
 
     agreement: search and descent in detail: step sizes, steps, groups and restraints.
 
+    correlation: does disagreement tell the error, over shapes and over groups of codes?
+
+    predictions: several codes for one image: do they differ where the image does not tell?
+
+    coverage: do the codes reach all backs that a front can have, and is anything drawn that is none of them?
+
     health: which choices keep a network listening to its image.
 
     front-vs-projection: free clouds moved by the front constraint and by projection losses. Besides trees, --data takes
@@ -171,7 +177,18 @@ class Experiment:
     """
 
     name: Positional[
-        Literal["deterministic", "critic", "stages", "views", "agreement", "health", "front-vs-projection"]
+        Literal[
+            "deterministic",
+            "critic",
+            "stages",
+            "views",
+            "agreement",
+            "correlation",
+            "predictions",
+            "coverage",
+            "health",
+            "front-vs-projection",
+        ]
     ]
     """Which one."""
     data: tuple[Path, ...]

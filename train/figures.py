@@ -93,7 +93,7 @@ def draw_cloud(
         pixels[:, 0], pixels[:, 1], s=area, c=colours(tone.numpy()), linewidths=0.2, edgecolors="#ffffffa0"
     )
     axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
-    _bare(axes)
+    bare(axes)
 
 
 def draw_image(axes: Axes, image: Tensor) -> None:
@@ -111,30 +111,35 @@ def mosaic(images: Tensor) -> Tensor:
     return grid.permute(2, 0, 3, 1, 4).flatten(3, 4).flatten(1, 2)
 
 
-def predictions_figure(example: Example) -> Figure:
-    """An image, several shapes it could be, the true one; seen from the image's side, and from behind."""
-    count = len(example.predictions)
-    figure, panels = _grid(rows=2, columns=count + 2)
-    draw_image(panels[0, 0], example.images[example.chosen])
-    _bare(panels[1, 0])
-    for row, camera in zip(panels, example.sides, strict=True):
-        for axes, cloud in zip(row[1:-1], example.predictions, strict=True):
-            draw_cloud(axes, cloud, camera)
-        draw_cloud(row[-1], example.truth, camera, colours=TRUE)
-    _titles(panels, ["the image", *(f"random code {i + 1}" for i in range(count)), "the true shape"])
-    _sides(panels[:, 1])
+def predictions_figure(*examples: Example) -> Figure:
+    """An image, several shapes it could be, the true one; seen from the image's side, and from behind.
+
+    Args:
+        examples: one or more, with the same number of predictions; each takes two rows.
+    """
+    count = len(examples[0].predictions)
+    figure, panels = grid(rows=2 * len(examples), columns=count + 2)
+    for example, pair in zip(examples, panels.reshape(len(examples), 2, -1), strict=True):
+        draw_image(pair[0, 0], example.images[example.chosen])
+        bare(pair[1, 0])
+        for row, camera in zip(pair, example.sides, strict=True):
+            for axes, cloud in zip(row[1:-1], example.predictions, strict=True):
+                draw_cloud(axes, cloud, camera)
+            draw_cloud(row[-1], example.truth, camera, colours=TRUE)
+        _sides(pair[:, 1])
+    titles(panels, ["the image", *(f"random code {i + 1}" for i in range(count)), "the true shape"])
     return figure
 
 
 def reconstruction_figure(example: Example) -> Figure:
     """All views of a shape, what was found from them, and the true shape; from one side and from behind."""
-    figure, panels = _grid(rows=1, columns=5)
+    figure, panels = grid(rows=1, columns=5)
     draw_image(panels[0, 0], mosaic(example.images))
     for axes, camera in zip(panels[0, 1:3], example.sides, strict=True):
         draw_cloud(axes, example.reconstruction, camera)
     for axes, camera in zip(panels[0, 3:], example.sides, strict=True):
         draw_cloud(axes, example.truth, camera, colours=TRUE)
-    _titles(
+    titles(
         panels,
         [f"{len(example.images)} images", "reconstruction", "from behind", "the true shape", "from behind"],
     )
@@ -144,7 +149,7 @@ def reconstruction_figure(example: Example) -> Figure:
 def overview_figure(examples: Sequence[Example]) -> Figure:
     """What the system does, in one picture: image, shapes it could be, the one that all images agree on, truth."""
     count, views = len(examples[0].predictions), len(examples[0].images)
-    figure, panels = _grid(rows=2 * len(examples), columns=count + 3)
+    figure, panels = grid(rows=2 * len(examples), columns=count + 3)
     for example, (upper, lower) in zip(examples, panels.reshape(len(examples), 2, -1), strict=True):
         draw_image(upper[0], example.images[example.chosen])
         draw_image(lower[0], mosaic(example.images))
@@ -155,7 +160,7 @@ def overview_figure(examples: Sequence[Example]) -> Figure:
             draw_cloud(row[-1], example.truth, camera, colours=TRUE)
         _sides([upper[1], lower[1]])
     guesses = [f"from this image, code {i + 1}" for i in range(count)]
-    _titles(panels, ["one image / all images", *guesses, f"from all {views} images", "the true shape"])
+    titles(panels, ["one image / all images", *guesses, f"from all {views} images", "the true shape"])
     return figure
 
 
@@ -232,7 +237,7 @@ def save(figure: Figure, path: Path) -> None:
         figure.savefig(temporary, format="png", facecolor="white")
 
 
-def _grid(*, rows: int, columns: int) -> tuple[Figure, np.ndarray]:
+def grid(*, rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     """A figure of square cells, tightly set, with room for titles above and labels to the left."""
     width, height = columns * _CELL_INCHES + 0.1, rows * _CELL_INCHES + 0.4
     figure = Figure(figsize=(width, height), dpi=110)
@@ -242,8 +247,9 @@ def _grid(*, rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     return figure, panels
 
 
-def _titles(panels: np.ndarray, titles: Sequence[str]) -> None:
-    for axes, title in zip(panels[0], titles, strict=True):
+def titles(panels: np.ndarray, words: Sequence[str]) -> None:
+    """Heads the columns of a `grid`."""
+    for axes, title in zip(panels[0], words, strict=True):
         axes.set_title(title, fontsize=11)
 
 
@@ -283,6 +289,7 @@ def _plain(axes: Axes) -> None:
     axes.grid(alpha=0.25)
 
 
-def _bare(axes: Axes) -> None:
+def bare(axes: Axes) -> None:
+    """Leaves a cell without frame and ticks."""
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)

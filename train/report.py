@@ -65,7 +65,9 @@ def write_report(
     result = json.loads((run / "evaluation.json").read_text())
     config = fit_config_from_json((run / "config.json").read_text(), where=str(run / "config.json"))
     model = load_generator(run)
-    examples = [make_example(model, shape, config, seed=seed) for shape in _pick(ShapeTree(data, "test"))]
+    examples = [
+        make_example(model, shape, config, seed=seed) for shape in pick_shapes(ShapeTree(data, "test"))
+    ]
     drawn = {
         "overview": figures.overview_figure(examples[:_FIRST_OVERVIEW_SHAPES]),
         **{f"predictions_{i}": figures.predictions_figure(example) for i, example in enumerate(examples, 1)},
@@ -99,27 +101,29 @@ def write_report(
 
 
 @torch.no_grad()
-def make_example(model: Generator, shape: Shape, config: FitConfig, *, seed: int) -> Example:
+def make_example(
+    model: Generator, shape: Shape, config: FitConfig, *, seed: int, codes: int = _CODES
+) -> Example:
     """A test shape, predictions from the image that shows its front best, and a reconstruction from all images."""
     chosen = int(
         shape.camera.position[:, 2].argmax()
     )  # objects face +z: their backs are what this view hides
-    codes = torch.randn(_CODES, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
-    predictions = model(shape.images[chosen : chosen + 1], codes)[:, 0]
+    drawn = torch.randn(codes, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
+    predictions = model(shape.images[chosen : chosen + 1], drawn)[:, 0]
     found = reconstruct(model, shape.images, seed=seed, settings=config.inference)
     images, camera = figures.close_up(shape.images, shape.camera, shape.points)
     return Example(images, camera, chosen, predictions, found.points[0], shape.points)
 
 
-def _pick(tree: ShapeTree) -> list[Shape]:
+def pick_shapes(tree: ShapeTree, count: int = _SHAPES) -> list[Shape]:
     """A few readable shapes, of as many categories as there are."""
     by_category: dict[str, list[Shape]] = {}
     for shape in tree.iter_valid():
         same = by_category.setdefault(shape.category, [])
-        if len(same) < _SHAPES:
+        if len(same) < count:
             same.append(shape)
     ranked = [(rank, shape) for same in by_category.values() for rank, shape in enumerate(same)]
-    picked = [shape for _, shape in sorted(ranked, key=lambda pair: pair[0])][:_SHAPES]
+    picked = [shape for _, shape in sorted(ranked, key=lambda pair: pair[0])][:count]
     if not picked:
         raise UserError(f"{tree.path} has no readable shape in its {tree.split} split")
     return picked

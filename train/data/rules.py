@@ -20,7 +20,7 @@ from train.errors import UserError
 # Not the acceptance's own terms: finer pictures, views between its views, other samples.
 _TERMS = {"size": 160, "fronts": 5, "sampling": 1}
 
-_NAME = re.compile(r"(?P<object>(?P<category>[a-z]+)_s(?P<seed>\d+)_(?P<index>\d+))_h\d")
+_NAME = re.compile(r"(?P<category>[a-z]+)_s(?P<seed>\d+)_(?P<index>\d+)_h\d")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,13 +101,33 @@ def measure_tree(data: Path, *, processes: int | None = None) -> RulesReport:
     found = {}
     for split in store.SPLITS:
         for shape in ShapeTree(data, split).ids:
-            match = _NAME.fullmatch(shape.split("/")[1])
-            if match and match["category"] in AMBIGUOUS:
-                entropy = (int(match["seed"]), int(match["index"]))
-                found[match["object"]] = _Object(match["category"], match["object"], entropy)
+            hider = hider_of(shape)
+            if hider:
+                name = shape.split("/")[1].rsplit("_h", 1)[0]
+                found[name] = _Object(hider.category, name, hider.seed)
     if not found:
         raise UserError(f"{data} holds no procedural object of {', '.join(AMBIGUOUS)}")
     return _measure([found[name] for name in sorted(found)], processes)
+
+
+class Hider(NamedTuple):
+    """An object of a family with designed ambiguity, as `variants_of` takes it."""
+
+    category: str
+    seed: tuple[int, int]
+
+
+def hider_of(shape: str) -> Hider | None:
+    """The object behind a shape "synset/model" of `data procedural`; None for other shapes and other families.
+
+    Example:
+        >>> hider_of("03001627/chair_s0_000012_h1")
+        Hider(category='chair', seed=(0, 12))
+    """
+    match = _NAME.fullmatch(shape.split("/")[-1])
+    if match is None or match["category"] not in AMBIGUOUS:
+        return None
+    return Hider(match["category"], (int(match["seed"]), int(match["index"])))
 
 
 class _Object(NamedTuple):

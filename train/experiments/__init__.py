@@ -8,10 +8,13 @@ from typing import Any
 
 from train.errors import UserError
 from train.experiments.agreement import agreement
+from train.experiments.correlation import correlation
+from train.experiments.coverage import coverage
 from train.experiments.critic import critic
 from train.experiments.front_vs_projection import run as front_vs_projection
 from train.experiments.health import health
 from train.experiments.paper import TABLES
+from train.experiments.predictions import predictions
 from train.experiments.table import make
 from train.experiments.workbench import Workbench
 
@@ -41,6 +44,7 @@ def _about_a_run(bench: Workbench, run: Path | None, views: int) -> dict[str, An
 _TRAINING: dict[str, Callable[[Workbench], dict[str, Any]]] = {"health": health}
 _TRAINING |= {name: lambda bench, table=table: make(table, bench) for name, table in TABLES.items()}
 _TRAINING["critic"] = critic
+_TRAINING |= {"correlation": correlation, "predictions": predictions, "coverage": coverage}
 _TRAINING["front-vs-projection"] = _about_losses
 
 EXPERIMENTS = ("agreement", *_TRAINING)

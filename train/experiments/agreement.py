@@ -27,6 +27,7 @@ from train import figures
 from train.batches import LoadedSplit
 from train.config import InferenceConfig
 from train.errors import UserError
+from train.experiments.correlation import pearson
 from train.experiments.table import table_row
 from train.files import write_text
 from train.runs import open_run
@@ -176,10 +177,6 @@ def _lowered(found: Scores) -> float:
 
 def _correlation(groups: Scores) -> dict[str, dict[str, float]]:
     """Pearson's r of the consistency loss with each error: over groups within a shape, and over shapes."""
-
-    def pearson(a: Tensor, b: Tensor) -> Tensor:
-        a, b = a - a.mean(0), b - b.mean(0)
-        return ((a * b).sum(0) / (a.square().sum(0) * b.square().sum(0)).sqrt().clamp(min=1e-12)).clamp(-1, 1)
 
     disagreement = groups["consistency"].double()
     found = {}

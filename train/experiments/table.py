@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from train import figures
 from train.config import FitConfig, InferenceConfig
-from train.experiments.workbench import Change, Workbench
+from train.experiments.workbench import Change, Workbench, as_it_is
 from train.files import write_text
 from train.scoring import Scores
 
@@ -33,10 +33,6 @@ NAMES = {
 }
 _RESAMPLES = 4000
 _SURE = 0.9
-
-
-def _as_it_is(config: FitConfig) -> FitConfig:
-    return config
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,7 +50,7 @@ class Row:
     """
 
     name: str
-    change: Change = _as_it_is
+    change: Change = as_it_is
     stage: Literal[1, 2] = 2
     codes: Literal["agreed", "searched", "random"] = "agreed"
     views: int = 8
@@ -237,6 +233,12 @@ def _cell(row: Mapping[str, Any], column: str) -> str:
 def table_row(cells: Sequence[str]) -> str:
     """A line of a Markdown table."""
     return f"| {' | '.join(cells)} |"
+
+
+def table_lines(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """The lines of a Markdown table; the first column is words, the others are figures."""
+    ruler = ["---", *["---:"] * (len(head) - 1)]
+    return [table_row(cells) for cells in (head, ruler, *rows)]
 
 
 def _figure(result: Mapping[str, Any], columns: Sequence[str]) -> Figure:

@@ -12,13 +12,14 @@ import dataclasses
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from safetensors.torch import load, save
 
+from models import Predictor
 from train.batches import LoadedSplit
 from train.checkpoint import best_weights, load_predictor
 from train.config import PROFILES, FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
@@ -29,6 +30,9 @@ from train.runs import read_split
 from train.scoring import Scores, compare, score
 from train.systems import image_size
 from train.trivial import medoid, nearest_by_image
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # What does not change a run's weights, and so not its name.
 _NO_PART_OF_A_KEY = (
@@ -117,29 +121,44 @@ class Workbench:
         stage: Literal[1, 2] = 2,
         views: int,
         split: Literal["val", "test"] = "test",
+        code_seed: int | None = None,
     ) -> Scores:
-        """Figure -> (M,) of a configuration's network, trained if need be. Codes and views are drawn by its seed."""
+        """Figure -> (M,) of a configuration's network, trained if need be. Codes and views are drawn by its seed.
+
+        Args:
+            config: the network.
+            settings: how its codes are chosen.
+            stage: whose best weights.
+            views: per shape.
+            split: what is scored.
+            code_seed: draws the codes in place of the configuration's seed.
+        """
         run = self.train(config)
-        data = self._data(config, split)
+        data = self.split(config, split)
 
         def take() -> Scores:
-            has_stage = f"stage{stage}" in config.phases  # a method of one phase has no second
-            model = load_predictor(best_weights(run, stage) if has_stage else run)
-            found = score(model, data, settings, views=views, seed=config.seed)
+            model = self.network(config, stage=stage)
+            found = score(model, data, settings, views=views, seed=config.seed, code_seed=code_seed)
             return {name: values.double() for name, values in found.items()}
 
         key = [run.name, stage, dataclasses.asdict(settings), views, split, data.fingerprint]
-        return self._kept(key, take)
+        return self.kept(key if code_seed is None else [*key, code_seed], take)
+
+    def network(self, config: FitConfig, *, stage: Literal[1, 2] = 2) -> Predictor:
+        """A configuration's network with the best weights of a stage, trained if need be."""
+        run = self.train(config)
+        has_stage = f"stage{stage}" in config.phases  # a method of one phase has no second
+        return load_predictor(best_weights(run, stage) if has_stage else run)
 
     def trivial_scores(
         self, answer: Literal["medoid", "nearest image"], config: FitConfig, *, views: int
     ) -> Scores:
         """Figure -> (M,) of an answer that needs no network, for the data that a configuration sees."""
         config = dataclasses.replace(config, seed=0)  # which changes nothing in the answer
-        test = self._data(config, "test")
+        test = self.split(config, "test")
 
         def take() -> Scores:
-            train = self._data(config, "train")
+            train = self.split(config, "train")
             points = load_predictor(self.train(config)).points
             if answer == "medoid":
                 clouds = train.points[medoid(train.points)].expand_as(test.points)
@@ -149,10 +168,10 @@ class Workbench:
             found = [compare(cloud.contiguous(), truth, points=points) for cloud, truth in parts]
             return {name: torch.cat([part[name] for part in found]).double() for name in found[0]}
 
-        return self._kept([answer, self.run_of(config).name, views, test.fingerprint], take)
+        return self.kept([answer, self.run_of(config).name, views, test.fingerprint], take)
 
-    def _data(self, config: FitConfig, split: Literal["train", "val", "test"]) -> LoadedSplit:
-        """A split of the first tree as a configuration reads it."""
+    def split(self, config: FitConfig, split: Literal["train", "val", "test"]) -> LoadedSplit:
+        """A split of the first tree as a configuration reads it; read once."""
         size = image_size(config)
         key = (split, *size, config.map_size, config.gt_pool, config.categories)
         if key not in self._loaded:
@@ -162,13 +181,41 @@ class Workbench:
             )
         return self._loaded[key]
 
-    def _kept(self, key: Sequence[object], take: Callable[[], Scores]) -> Scores:
+    def kept(self, key: Sequence[object], take: Callable[[], Scores]) -> Scores:
+        """What was measured under a key of plain JSON values: taken now, and kept, or there already.
+
+        Args:
+            key: all that the measurement depends on: the run's name, the split's fingerprint, settings.
+            take: measures.
+        """
         path = self.out / "scores" / f"{_digest(json.dumps(key, sort_keys=True))}.safetensors"
         if not path.exists():
             found = take()
             with replacing(path) as temporary:
                 temporary.write_bytes(save(found))
         return load(path.read_bytes())
+
+    def publish(self, name: str, result: Mapping[str, Any], page: str, figure: Figure) -> None:
+        """Writes NAME.json, NAME.md and NAME.png."""
+        from train import figures  # matplotlib takes a second to import
+
+        write_text(self.out / f"{name}.json", json.dumps(result, indent=2) + "\n")
+        write_text(self.out / f"{name}.md", page)
+        figures.save(figure, self.out / f"{name}.png")
+
+    def about(self, config: FitConfig) -> dict[str, Any]:
+        """What every result says of its making: profile, data, seeds, and the networks' configuration."""
+        return {
+            "profile": self.profile,
+            "data": [str(root) for root in self.data],
+            "seeds": self.seeds,
+            "config": dataclasses.asdict(config),
+        }
+
+
+def as_it_is(config: FitConfig) -> FitConfig:
+    """The change that changes nothing: our own system as the profile has it."""
+    return config
 
 
 def _digest(text: str) -> str:
