@@ -51,16 +51,21 @@ def build_generator(
     return Generator(config)
 
 
+_EXISTS = 1.0  # added to the logits: to begin with all points exist
+
+
 class Prediction(NamedTuple):
     """What R codes make of B images.
 
     Attributes:
         points: (R, B, N, 3) in the world frame.
         latents: (R, B, models.LATENT_DIM) the shape codes from which a network with a latent ending made them; or None.
+        logits: (R, B, N) of the points' existence, from a network that knows of it; or None.
     """
 
     points: Tensor
     latents: Tensor | None
+    logits: Tensor | None = None
 
 
 class Generator(nn.Module):
@@ -113,12 +118,13 @@ class Generator(nn.Module):
             codes: (R, B, code_dim), drawn from N(0, 1).
 
         Returns:
-            (R, B, N, 3) points in the world frame.
+            (R, B, N, 3) points in the world frame. Where a network says that points do not exist, others that do stand
+            there once more.
         """
-        return self.predict(images, codes).points
+        return _existing(self.predict(images, codes))
 
     def predict(self, images: Tensor, codes: Tensor) -> Prediction:
-        """As `forward`, with the shape codes on the way."""
+        """As `forward`, with what else is known of them, and all points whether they exist or not."""
         if images.ndim != 4 or images.shape[1] != 3:
             raise ValueError(f"Generator: 'images' must be (B, 3, H, W) in [0, 1]; got {tuple(images.shape)}")
         return self._decode(self.encode(images), codes)
@@ -130,8 +136,8 @@ class Generator(nn.Module):
             return self.trunk(prepared.contiguous(memory_format=torch.channels_last))
 
     def decode(self, features: Tensor, codes: Tensor) -> Tensor:
-        """(B, C, h, w) features and (R, B, code_dim) codes -> (R, B, N, 3) points."""
-        return self._decode(features, codes).points
+        """(B, C, h, w) features and (R, B, code_dim) codes -> (R, B, N, 3) points, as `forward`."""
+        return _existing(self._decode(features, codes))
 
     def _decode(self, features: Tensor, codes: Tensor) -> Prediction:
         if codes.ndim != 3 or codes.shape[1:] != (features.shape[0], self.code_dim):
@@ -147,6 +153,8 @@ class Generator(nn.Module):
                 joined = self._join(features, self.code_branch(codes.flatten(0, 1)), repeats)
                 made = self.decoder(joined).unflatten(0, codes.shape[:2])
         made = made.expand(repeats, *made.shape[1:])
+        if self.config.existence:
+            return Prediction(made[..., :3], None, made[..., 3] + _EXISTS)
         if self.shape_decoder is None:
             return Prediction(made, None)
         return Prediction(self.shape_decoder(made.flatten(0, 1)).unflatten(0, made.shape[:2]), made)
@@ -160,3 +168,14 @@ class Generator(nn.Module):
         tiled = features.expand(repeats, *features.shape).flatten(0, 1)
         joined = torch.cat([tiled, code_features], dim=1)
         return joined.contiguous(memory_format=torch.channels_last)
+
+
+def _existing(predicted: Prediction) -> Tensor:
+    """(R, B, N, 3): in the place of points that do not exist those that do, in turns; all, if none exists."""
+    points, logits = predicted.points, predicted.logits
+    if logits is None:
+        return points
+    exists = (logits > 0) | (logits <= 0).all(-1, keepdim=True)
+    order = exists.to(torch.uint8).argsort(dim=-1, descending=True, stable=True)
+    turns = torch.arange(points.shape[2], device=points.device) % exists.sum(-1, keepdim=True)
+    return torch.take_along_dim(points, order.gather(-1, turns)[..., None], 2)

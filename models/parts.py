@@ -119,7 +119,8 @@ class PointDecoder(_Narrowing):
         super().__init__(config)
         c64, c128, c256, c512 = (_widen(c, config.decoder_width) for c in (64, 128, 256, 512))
         joined = _joined_channels(config)
-        self.fc_points = nn.Linear(self.fc_width, 3 * config.fc_points)
+        self.values = config.values_per_point
+        self.fc_points = nn.Linear(self.fc_width, self.values * config.fc_points)
 
         self.up5, self.skip5 = _deconv(c512, c256), _conv(c512, c256)
         self.merge5 = _conv_relu(c256, (c256, 3, 1))
@@ -127,7 +128,7 @@ class PointDecoder(_Narrowing):
         self.merge4 = _conv_relu(c128, (c128, 3, 1))
         self.up3, self.skip3 = _deconv(c128, c64), _conv(joined, c64)
         self.merge3 = _conv_relu(c64, (c64, 3, 1), (c64, 3, 1))
-        self.conv_points = _conv(c64, 6)
+        self.conv_points = _conv(c64, 2 * self.values)
 
     def forward(self, joined: Tensor) -> Tensor:
         x4, x5, bottleneck, vector = self.narrow(joined)
@@ -138,8 +139,10 @@ class PointDecoder(_Narrowing):
         # none.
         x = self.merge3(F.relu(F.relu(_crop(self.up3(x), joined)) + self.skip3(joined)))
         with full_precision(joined):
-            fc_points = self.fc_points(vector.float()).unflatten(1, (-1, 3))
-            conv_points = self.conv_points(x.float()).permute(0, 2, 3, 1).reshape(len(joined), -1, 3)
+            fc_points = self.fc_points(vector.float()).unflatten(1, (-1, self.values))
+            conv_points = (
+                self.conv_points(x.float()).permute(0, 2, 3, 1).reshape(len(joined), -1, self.values)
+            )
             return torch.cat([fc_points, conv_points], dim=1)
 
 

@@ -24,6 +24,7 @@ class GeneratorConfig:
         ending: "points": a fully connected and a convolutional branch make the points (the released network).
             "latent": the network ends in an auto-encoder's code, and that one's decoder makes the points; it is
             given by `adopt_decoder` and never trained here (the network of the paper's text).
+        existence: give every point a logit of its existence too, for losses that may delete points.
     """
 
     profile: str = "cpu"
@@ -33,6 +34,7 @@ class GeneratorConfig:
     decoder_width: float = 0.25
     deterministic: bool = False
     ending: Ending = "points"
+    existence: bool = False
 
     def __post_init__(self) -> None:
         if self.image_height % 8 or self.image_width % 8 or min(self.image_height, self.image_width) < 8:
@@ -42,6 +44,15 @@ class GeneratorConfig:
             )
         if self.ending not in ("points", "latent"):
             raise ValueError(f"GeneratorConfig: ending must be 'points' or 'latent'; got {self.ending!r}")
+        if self.existence and self.ending == "latent":
+            raise ValueError(
+                "GeneratorConfig: existence needs ending='points': a decoder of shapes gives no logits"
+            )
+
+    @property
+    def values_per_point(self) -> int:
+        """x, y, z, and the logit of existence if points have one."""
+        return 4 if self.existence else 3
 
     @property
     def grid(self) -> tuple[int, int]:

@@ -13,9 +13,10 @@ from PIL import Image
 from diffpoint import chamfer_distance, unproject
 from train.__main__ import main
 from train.errors import UserError
-from train.experiments.free_clouds import LOSSES, fit_cloud, in_silhouette
+from train.experiments.free_clouds import LOSSES, fit_cloud
 from train.experiments.front_vs_projection import run
 from train.experiments.study_shapes import Cameras, embedded_shape, shapes_of
+from train.metrics import in_silhouette
 
 ONE, TWO, SPHERE = Cameras(1), Cameras(2), Cameras(6, sphere=True)
 
@@ -39,7 +40,7 @@ def test_the_surface_is_where_the_depth_maps_are(cameras):
     for view in range(cameras.count):
         points = observed.points[:, view, : int(observed.lengths[0, view])]
         assert chamfer_distance(points, scene.surface, squared=False).a_to_b < 0.015
-    assert in_silhouette(scene, scene.surface, margin=1).float().mean() > 0.99
+    assert in_silhouette(scene.surface, scene.camera, scene.depth, margin=1).float().mean() > 0.99
 
 
 def test_cameras_of_the_sphere_look_from_above_and_from_below():

@@ -60,8 +60,8 @@ def test_front_loss_has_the_papers_unit(distance: str) -> None:
     distances = moved.norm(dim=-1)
     expected = distances.sum() * (56 / 8) ** 2 if distance == "emd" else 200 * distances.mean()
     assert front.loss.item() == pytest.approx(expected.item(), rel=2e-2)
-    assert front.matched_share == 1
-    assert front.fallback_share == 0
+    assert front.shares["matched_share"] == 1
+    assert front.shares["fallback_share"] == 0
 
 
 def test_a_cloud_out_of_sight_is_counted_and_pulled_in() -> None:
@@ -70,7 +70,7 @@ def test_a_cloud_out_of_sight_is_counted_and_pulled_in() -> None:
     points = (torch.rand(1, 20, 3) + torch.tensor([0.0, 30.0, 0.0])).requires_grad_()
     front = front_loss(Scene(points, camera, depth), "chamfer")
     front.loss.backward()
-    assert front.fallback_share == 1
+    assert front.shares["fallback_share"] == 1
     assert points.grad is not None
     assert (points.grad[..., 1] > 0).any()  # descent lowers y
 

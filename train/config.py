@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from diffpoint.visibility import Method as Visibility
 from train.errors import UserError
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ Profile = Literal["full", "cpu", "smoke"]
 Variant = Literal["standard", "highly-diverse"]
 Ending = Literal["points", "latent"]
 Precision = Literal["float32", "bfloat16"]
+Supervision = Literal["front", "projection", "lin", "soft"]
 System = Literal["ours", "psgn", "psgn-mon", "front-mon", "lin", "r2n2", "ptn"]
 
 # The paper's alpha multiplies the released code's approximate EMD: a sum over 2048 points, about 1.3 times
@@ -99,6 +101,12 @@ class StageConfig(Schedule):
     select: Literal["cd", "fps_cd", "cd_1"]
     """Validation figure by which the stage's best checkpoint is chosen: of all views joined, of these thinned to the
     size of one prediction, or of one view."""
+    supervision: Supervision = "front"
+    """How predictions meet the depth maps of their images. "front" is the paper's front constraint. The others take its
+    place, in its unit: "projection", the depth of rendered pixels; "lin", that and a mask term on the points'
+    existence, as Lin et al. have it; "soft", depth and mask of a soft rendering."""
+    visibility: Visibility = "zbuffer"
+    """How the front constraint finds the predicted points that a camera sees; see `diffpoint.visible_points`."""
     joined_diversity: bool = False
     """False: the diversity loss compares single-view clouds. True: the concatenated clouds of all views, as in
     the paper's "highly diverse" model."""
@@ -230,6 +238,11 @@ class FitConfig:
     def needs_autoencoder(self) -> bool:
         """Does a critic judge codes, or a decoder make the points?"""
         return self.ending == "latent" or any(stage.gamma > 0 for stage in self.stages)
+
+    @property
+    def existence(self) -> bool:
+        """Does a loss ask which points exist?"""
+        return any(stage.supervision == "lin" for stage in self.stages)
 
     @property
     def phases(self) -> dict[str, PretrainConfig | StageConfig]:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from diffpoint import earth_mover_distance, farthest_point_sample, nearest
+from diffpoint import (
+    PinholeCamera,
+    earth_mover_distance,
+    farthest_point_sample,
+    front_constraint,
+    nearest,
+    project,
+)
 
 FSCORE_DISTANCE = 0.01
 """World units, that is 1 % of an object's size: how near counts as found."""
@@ -65,3 +74,32 @@ def thin_out(clouds: Tensor, count: int) -> Tensor:
         return clouds
     index = farthest_point_sample(clouds, count)
     return torch.take_along_dim(clouds, index[..., None], dim=-2)
+
+
+def visible_error(points: Tensor, camera: PinholeCamera, depth: Tensor) -> Tensor:
+    """(B, V) chamfer distance x100 between what views see of clouds and what they saw of the shapes.
+
+    It is the front constraint, as a measure for clouds of whatever origin. Where a view sees nothing of a cloud, the
+    whole cloud is compared.
+
+    Args:
+        points: (B, N, 3) in the world.
+        camera: (B, V), of the depth maps' size.
+        depth: (B, V, H, W) true depth maps, +inf where empty.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="front_constraint: in ", category=RuntimeWarning)
+        return 100 * front_constraint(points, camera, depth, reduction="none")
+
+
+def in_silhouette(points: Tensor, camera: PinholeCamera, depth: Tensor, *, margin: int = 0) -> Tensor:
+    """(B, V, N): does the point project into a pixel where the shape is, or `margin` pixels beside one?
+
+    Args: as `visible_error`.
+    """
+    silhouette = F.max_pool2d(torch.isfinite(depth).float(), 2 * margin + 1, 1, margin) > 0
+    pixels = project(points, camera).pixels
+    size = torch.tensor([camera.width, camera.height])
+    inside = ((pixels >= 0) & (pixels < size)).all(-1)
+    u, v = pixels.long().clamp(torch.zeros(2, dtype=torch.long), size - 1).unbind(-1)
+    return inside & silhouette.flatten(2).gather(2, v * camera.width + u)

@@ -14,7 +14,7 @@ from train.batches import Batch
 from train.config import StageConfig
 from train.errors import UserError
 from train.laps import Laps
-from train.objective import arrange_scenes, front_loss, spread_loss
+from train.objective import arrange_scenes, spread_loss, supervise
 from train.parallel import ALONE, World
 
 
@@ -73,8 +73,10 @@ def training_step(
     laps.stop("network")
 
     # Every cloud before its own image's camera, or a shape's clouds joined and before each of its cameras.
-    scene = arrange_scenes(clouds, batch.camera, batch.depth, joined_views=stage.joined_views)
-    front = front_loss(scene, stage.front)
+    scene = arrange_scenes(
+        clouds, batch.camera, batch.depth, joined_views=stage.joined_views, logits=predicted.logits
+    )
+    front = supervise(scene, stage, step=step)
 
     # Clouds of one image must differ as much as their codes do.
     beta, diversity = stage.diversity_weight(step), torch.zeros(())
@@ -99,8 +101,7 @@ def training_step(
     world.average_gradients(learner.generator)
     learner.optimiser.step()
     laps.stop("network")
-    shares = {"matched_share": front.matched_share, "fallback_share": front.fallback_share}
-    values = {"loss": loss, "front": front.loss, "diversity": diversity, **judgement, **shares}
+    values = {"loss": loss, "front": front.loss, "diversity": diversity, **judgement, **front.shares}
     return {name: value.detach() for name, value in values.items()}
 
 

@@ -76,7 +76,10 @@ METHODS: dict[System, Method] = {
 def size_of(config: FitConfig) -> GeneratorConfig:
     """The generator that a configuration of our own system trains."""
     return dataclasses.replace(
-        SIZES[config.profile], deterministic=config.deterministic, ending=config.ending
+        SIZES[config.profile],
+        deterministic=config.deterministic,
+        ending=config.ending,
+        existence=config.existence,
     )
 
 
@@ -94,7 +97,13 @@ def build_network(config: FitConfig) -> Predictor:
 
 def _check(config: FitConfig) -> None:
     if config.system == "ours":
+        if config.existence and config.ending == "latent":
+            raise UserError("supervision lin needs points that may be deleted; leave --ending at points")
         return
+    if any((stage.supervision, stage.visibility) != ("front", "zbuffer") for stage in config.stages):
+        raise UserError(
+            f"--system {config.system} has a loss of its own; leave supervision and visibility alone"
+        )
     if config.needs_autoencoder or config.deterministic or config.variant != "standard":
         raise UserError(
             f"--system {config.system} knows no critic, latent ending, deterministic counterpart or variant; "

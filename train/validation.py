@@ -6,9 +6,10 @@ import torch
 
 from models import Autoencoder, Generator, Predictor
 from train.batches import LoadedSplit
-from train.metrics import cloud_errors, thin_out
+from train.metrics import cloud_errors, in_silhouette, thin_out, visible_error
 from train.parallel import ALONE, World
 
+FIGURES = ("val_cd_1", "val_cd", "val_fps_cd", "val_visible", "val_inside")
 _SHAPES_AT_ONCE = 8
 
 
@@ -17,13 +18,16 @@ def validate(model: Predictor, split: LoadedSplit, *, seed: int, world: World = 
     """Mean errors x100 over a split: one view (`val_cd_1`), all views joined (`val_cd`), and thinned
     (`val_fps_cd`). Of another method's network all views are scored as it answers: together, or one by one.
 
+    Beside the truth, what a view saw of it: `val_visible`, the error x100 of what it sees of its own prediction, and
+    `val_inside`, the share of that prediction in its silhouette.
+
     The codes are the same at every call, so that two checkpoints differ by their weights alone. A group of processes
     shares the shapes.
     """
     codes = torch.randn(
         1, len(split), split.views, model.code_dim, generator=torch.Generator().manual_seed(seed)
     )
-    sums = torch.zeros(3)
+    sums = torch.zeros(len(FIGURES))
     for shapes in torch.arange(world.rank, len(split), world.size).split(_SHAPES_AT_ONCE):
         views = torch.arange(split.views).expand(len(shapes), -1)
         images = split.float_images(shapes, views).flatten(0, 1)
@@ -34,16 +38,19 @@ def validate(model: Predictor, split: LoadedSplit, *, seed: int, world: World = 
             images = images.unflatten(0, views.shape)
             first, answers = model.answers(images[:, :1]), model.answers(images)
         truth = split.points[shapes][:, None]
+        seen = split.batch(shapes, views[:, :1])
         each_truth = truth.expand(-1, answers.shape[1], -1, -1)
         sums += torch.stack(
             [
                 cloud_errors(first, truth).cd.sum(),
                 cloud_errors(answers, each_truth).cd.mean(1).sum(),
                 cloud_errors(thin_out(answers, model.points), each_truth).cd.mean(1).sum(),
+                visible_error(first[:, 0], seen.camera, seen.depth).sum(),
+                in_silhouette(first[:, 0], seen.camera, seen.depth).float().mean(-1).sum(),
             ]
         )
     means = (world.sum(sums) / len(split)).tolist()
-    return dict(zip(("val_cd_1", "val_cd", "val_fps_cd"), means, strict=True))
+    return dict(zip(FIGURES, means, strict=True))
 
 
 @torch.no_grad()

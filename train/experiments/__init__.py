@@ -11,7 +11,7 @@ from train.experiments.agreement import agreement
 from train.experiments.correlation import correlation
 from train.experiments.coverage import coverage
 from train.experiments.critic import critic
-from train.experiments.front_vs_projection import run as front_vs_projection
+from train.experiments.front_vs_projection import front_vs_projection
 from train.experiments.health import health
 from train.experiments.paper import TABLES
 from train.experiments.predictions import predictions
@@ -19,17 +19,6 @@ from train.experiments.table import make
 from train.experiments.workbench import Workbench
 
 __all__ = ["EXPERIMENTS", "Workbench", "run_experiment"]
-
-
-def _about_losses(bench: Workbench) -> dict[str, Any]:
-    return front_vs_projection(
-        bench.data,
-        bench.out,
-        seeds=bench.seeds,
-        limit=bench.limit,
-        iterations=bench.steps,
-        progress=bench.progress,
-    )
 
 
 def _about_a_run(bench: Workbench, run: Path | None, views: int) -> dict[str, Any]:
@@ -45,7 +34,7 @@ _TRAINING: dict[str, Callable[[Workbench], dict[str, Any]]] = {"health": health}
 _TRAINING |= {name: lambda bench, table=table: make(table, bench) for name, table in TABLES.items()}
 _TRAINING["critic"] = critic
 _TRAINING |= {"correlation": correlation, "predictions": predictions, "coverage": coverage}
-_TRAINING["front-vs-projection"] = _about_losses
+_TRAINING["front-vs-projection"] = front_vs_projection
 
 EXPERIMENTS = ("agreement", *_TRAINING)
 """Names of all experiments."""

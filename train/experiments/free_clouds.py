@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
-from diffpoint import chamfer_distance, front_constraint, project, projection_loss, soft_projection_loss
+from diffpoint import chamfer_distance, front_constraint, projection_loss, soft_projection_loss
 from train.experiments.study_shapes import Scene
+from train.metrics import in_silhouette, visible_error
 
 MEASURED_EVERY = 10
 
@@ -119,7 +119,7 @@ def fit_cloud(scene: Scene, loss: Loss, *, iterations: int, rate: float, kept: S
         if iteration in kept:
             clouds[iteration] = existing[0]
         if iteration % MEASURED_EVERY == 0:
-            visible_cd.append(visible_chamfer(scene, existing))
+            visible_cd.append(_visible_cd(scene, existing))
         begun = time.perf_counter()
         for group in optimiser.param_groups:
             group["lr"] = rate * (1 + math.cos(math.pi * iteration / iterations)) / 2
@@ -141,7 +141,7 @@ def fit_cloud(scene: Scene, loss: Loss, *, iterations: int, rate: float, kept: S
         sum(sideways) / len(sideways),
         largest,
         losses,
-        [*visible_cd, visible_chamfer(scene, existing)],
+        [*visible_cd, _visible_cd(scene, existing)],
         clouds,
         1000 * seconds / iterations,
     )
@@ -155,28 +155,16 @@ def _existing(cloud: Tensor, logits: Tensor | None) -> Tensor:
     return cloud[:, logits[0] > 0]
 
 
-def visible_chamfer(scene: Scene, cloud: Tensor) -> float:
-    """`Measures.visible_cd`: the value of the front constraint, x100, for a cloud of whatever origin."""
-    return 100 * _quietly(lambda: front_constraint(cloud, scene.camera, scene.depth)).item()
-
-
-def in_silhouette(scene: Scene, cloud: Tensor, *, margin: int = 0) -> Tensor:
-    """(V, N): does the point project into a pixel where the shape is, or `margin` pixels beside one?"""
-    silhouette = torch.isfinite(scene.depth[0]).float()
-    silhouette = F.max_pool2d(silhouette, 2 * margin + 1, 1, margin) > 0
-    pixels = project(cloud, scene.camera).pixels[0]
-    inside = ((pixels >= 0) & (pixels < scene.camera.width)).all(-1)
-    u, v = pixels.clamp(0, scene.camera.width - 1).long().unbind(-1)
-    view = torch.arange(len(pixels))[:, None]
-    return inside & silhouette[view, v, u]
+def _visible_cd(scene: Scene, cloud: Tensor) -> float:
+    return visible_error(cloud, scene.camera, scene.depth).mean().item()
 
 
 def measure(scene: Scene, cloud: Tensor) -> Measures:
     """All measures of a cloud (1, M, 3)."""
     whole = chamfer_distance(cloud, scene.surface, squared=False)
     return Measures(
-        visible_cd=visible_chamfer(scene, cloud),
-        inside=in_silhouette(scene, cloud).float().mean().item(),
+        visible_cd=_visible_cd(scene, cloud),
+        inside=in_silhouette(cloud, scene.camera, scene.depth).float().mean().item(),
         pred_to_gt=100 * whole.a_to_b.item(),
         gt_to_pred=100 * whole.b_to_a.item(),
         left=cloud.shape[1] / scene.start.shape[1],

@@ -1,14 +1,19 @@
-"""Front constraint or projection loss? Free clouds fitted to depth maps by every loss, from one view to twenty-four.
+"""Front constraint or projection loss? Free clouds fitted to depth maps by every loss, from one view to twenty-four;
+and networks that learn by each of them.
 
-OUT/front-vs-projection.json, .md, .png    what was found: all numbers, tables, curves
-OUT/front-vs-projection-clouds.png, .gif   the clouds of one shape on their way
-OUT/free-clouds/*.json                     one fit each: a study that was stopped goes on where it was
+OUT/front-vs-projection.json, .md, .png         what was found: all numbers, tables, curves of the free clouds
+OUT/front-vs-projection-clouds.png, .gif        the clouds of one shape on their way
+OUT/front-vs-projection-networks.png            curves of the networks
+OUT/front-vs-projection-predictions.png         what they predict
+OUT/free-clouds/*.json, OUT/runs, OUT/scores    one fit or training each: a study that was stopped goes on where it was
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,9 +22,12 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from train import figures
 from train.errors import UserError
 from train.experiments import front_vs_projection_page as page
+from train.experiments import loss_trainings_page as networks_page
 from train.experiments.free_clouds import LOSSES, Fit, fit_cloud
+from train.experiments.loss_trainings import examples, study, trees_among
 from train.experiments.study_shapes import (
     EMBEDDED,
     Cameras,
@@ -28,6 +36,7 @@ from train.experiments.study_shapes import (
     embedded_shape,
     shapes_of,
 )
+from train.experiments.workbench import Workbench
 from train.files import kept, write_text
 
 SETTINGS = tuple(Cameras(n) for n in (1, 2, 4, 8)) + tuple(Cameras(n, sphere=True) for n in (8, 24))
@@ -48,6 +57,35 @@ class Cell(NamedTuple):
     @property
     def file(self) -> str:
         return f"{self.shape}-{self.cameras.name.replace(' ', '-')}-{self.loss}-seed{self.seed}.json"
+
+
+def front_vs_projection(bench: Workbench) -> dict[str, Any]:
+    """The whole study: free clouds on all of the bench's data, and networks on its data trees, if there are any.
+
+    Returns:
+        What front-vs-projection.json holds; "networks" is what `loss_trainings.study` found.
+    """
+    found = run(
+        bench.data,
+        bench.out,
+        seeds=bench.seeds,
+        limit=bench.limit,
+        iterations=bench.steps,
+        progress=bench.progress,
+    )
+    trees = trees_among(bench.data)
+    if not trees:
+        print("no data tree among --data: the networks are left out", file=sys.stderr)
+        return found
+    trained = dataclasses.replace(bench, data=trees)
+    found["networks"] = study(trained)
+    write_text(bench.out / "front-vs-projection.json", json.dumps(found, indent=1) + "\n")
+    tables = page.markdown(found), networks_page.markdown(found["networks"])
+    write_text(bench.out / "front-vs-projection.md", "\n".join(tables))
+    figures.save(networks_page.curves(found["networks"]), bench.out / "front-vs-projection-networks.png")
+    drawn = networks_page.predictions(examples(trained))
+    figures.save(drawn, bench.out / "front-vs-projection-predictions.png")
+    return found
 
 
 def run(

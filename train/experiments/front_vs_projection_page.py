@@ -15,10 +15,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from train.experiments.free_clouds import LOSSES, MEASURED_EVERY, Fit, fit_cloud, in_silhouette
+from train.experiments.free_clouds import LOSSES, MEASURED_EVERY, Fit, fit_cloud
 from train.experiments.study_shapes import Cameras, Scene, StudyShape
 from train.figures import save
 from train.files import replacing
+from train.metrics import in_silhouette
 
 MEASURES = {
     "visible_cd": "visible part, chamfer x100",
@@ -241,7 +242,7 @@ def draw_cloud(axes: Axes, scene: Scene, cloud: Tensor) -> None:
     angle = torch.deg2rad(torch.tensor(70.0))
     x, y, z = (cloud - scene.surface[0].mean(0)).unbind(-1)
     across, away = z * angle.sin() + x * angle.cos(), z * angle.cos() - x * angle.sin()
-    inside = in_silhouette(scene, cloud[None], margin=1).all(0)
+    inside = in_silhouette(cloud[None], scene.camera, scene.depth, margin=1)[0].all(0)
     order = away.argsort(descending=True)
     colours = [INSIDE if kept else OUTSIDE for kept in inside[order].tolist()]
     axes.scatter(across[order], -y[order], c=colours, s=4, linewidths=0)

@@ -28,7 +28,7 @@ from train.files import replacing, write_text
 from train.fit import fit
 from train.runs import read_split
 from train.scoring import Scores, compare, score
-from train.systems import image_size
+from train.systems import build_network, image_size
 from train.trivial import medoid, nearest_by_image
 
 if TYPE_CHECKING:
@@ -133,21 +133,50 @@ class Workbench:
             split: what is scored.
             code_seed: draws the codes in place of the configuration's seed.
         """
-        run = self.train(config)
+
+        def measure(model: Predictor, data: LoadedSplit) -> Scores:
+            return score(model, data, settings, views=views, seed=config.seed, code_seed=code_seed)
+
+        what = [dataclasses.asdict(settings), views, *([] if code_seed is None else [code_seed])]
+        return self.measured(config, what, measure, stage=stage, split=split)
+
+    def measured(
+        self,
+        config: FitConfig,
+        what: object,
+        measure: Callable[[Predictor, LoadedSplit], Scores],
+        *,
+        stage: Literal[0, 1, 2] = 2,
+        split: Literal["val", "test"] = "test",
+    ) -> Scores:
+        """What a function finds of a configuration's network on a split, trained and measured if need be.
+
+        Args:
+            config: whose network.
+            what: names the measurement, with everything that decides its outcome; can be written as JSON.
+            measure: makes it.
+            stage: see `network`.
+            split: of the first tree.
+        """
         data = self.split(config, split)
+        run = self.train(config)
 
         def take() -> Scores:
-            model = self.network(config, stage=stage)
-            found = score(model, data, settings, views=views, seed=config.seed, code_seed=code_seed)
+            found = measure(self.network(config, stage=stage), data)
             return {name: values.double() for name, values in found.items()}
 
-        key = [run.name, stage, dataclasses.asdict(settings), views, split, data.fingerprint]
-        return self.kept(key if code_seed is None else [*key, code_seed], take)
+        return self.kept([run.name, stage, what, split, data.fingerprint], take)
 
-    def network(self, config: FitConfig, *, stage: Literal[1, 2] = 2) -> Predictor:
-        """A configuration's network with the best weights of a stage, trained if need be."""
+    def network(self, config: FitConfig, *, stage: Literal[0, 1, 2] = 2) -> Predictor:
+        """A configuration's network with the best weights of a stage, trained if need be.
+
+        Stage 0 is the fresh network, before training; a method without the stage gives its last.
+        """
+        if stage == 0:
+            torch.manual_seed(config.seed)
+            return build_network(config)
         run = self.train(config)
-        has_stage = f"stage{stage}" in config.phases  # a method of one phase has no second
+        has_stage = f"stage{stage}" in config.phases
         return load_predictor(best_weights(run, stage) if has_stage else run)
 
     def trivial_scores(

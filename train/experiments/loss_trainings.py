@@ -1,0 +1,324 @@
+"""The network under each loss: front constraint, projection losses, another visibility; everything else equal."""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffpoint import PinholeCamera, farthest_point_sample, nearest, visible_points
+from models import Predictor
+from train.batches import LoadedSplit
+from train.config import FitConfig, InferenceConfig, StageConfig, Supervision
+from train.experiments.workbench import Workbench
+from train.fit import STAGES
+from train.log import read_metrics
+from train.metrics import cloud_errors, in_silhouette, visible_error
+from train.scoring import SHAPES_AT_ONCE, Scores, view_order
+from train.systems import size_of
+from train.validation import validate
+
+Verdict = Literal["converged", "in between", "did not converge"]
+
+_STAGE1_SHARE, _STAGE2_SHARE, _MANY_SHARE = 0.25, 0.2, 0.35
+"""Of the profile's steps, with half of its shapes in a batch: enough to see what converges, little enough for all of
+them in an hour and a half."""
+_VIEWS = 8
+_RANDOM = InferenceConfig(groups=1, steps=0)
+_PARTS = 32
+_CURVES = ("visible", "inside", "cd_1", "cd")
+
+
+@dataclasses.dataclass(frozen=True)
+class Taught:
+    """A way to train.
+
+    Attributes:
+        name: of the loss, as tables show it.
+        colour: of its curves.
+        supervision: see `StageConfig`.
+        visibility: see `StageConfig`.
+    """
+
+    name: str
+    colour: str
+    supervision: Supervision
+    visibility: Literal["zbuffer", "horizon"] = "zbuffer"
+
+    def config(self, config: FitConfig, *, single: bool) -> FitConfig:
+        """A profile's recipe under this loss.
+
+        The guard against networks that stop to look at their image is off: here that is a result.
+
+        Args:
+            config: the profile's.
+            single: True: stage 1 on single views, then stage 2 on joined ones. False: stage 2 alone, from fresh weights
+                and longer.
+        """
+
+        def stage(like: StageConfig, share: float) -> StageConfig:
+            like = like.lasting(max(1, round(share * like.steps)))
+            return dataclasses.replace(
+                like,
+                shapes=max(1, like.shapes // 2),
+                supervision=self.supervision,
+                visibility=self.visibility,
+            )
+
+        changes: dict[str, Any] = {
+            "stage1": stage(config.stage1, _STAGE1_SHARE),
+            "stage2": stage(config.stage2, _STAGE2_SHARE),
+        }
+        if not single:
+            changes = {
+                "stage1": dataclasses.replace(config.stage1, steps=0),
+                "stage2": stage(config.stage2, _MANY_SHARE),
+            }
+        every = max(1, changes["stage2"].steps // 4)
+        return dataclasses.replace(
+            config, **changes, min_image_sensitivity=0.0, validate_every=every, health_every=every,
+            validation_shapes=min(16, config.validation_shapes),
+        )  # fmt: skip
+
+
+TAUGHT: dict[str, Taught] = {
+    "front": Taught("front constraint", "#22577a", "front"),
+    "horizon": Taught("front constraint, hidden points dropped", "#57a0c9", "front", "horizon"),
+    "projection": Taught("projection loss, depth alone", "#c8553d", "projection"),
+    "lin": Taught("projection loss of Lin et al.", "#e59866", "lin"),
+    "soft": Taught("soft projection loss", "#6a994e", "soft"),
+}
+
+
+def configs(bench: Workbench) -> list[FitConfig]:
+    """All trainings of the study, seed by seed."""
+    return [
+        bench.config(lambda config, t=taught, s=single: t.config(config, single=s), seed=seed)
+        for seed in range(bench.seeds)
+        for single in (True, False)
+        for taught in TAUGHT.values()
+        if single or taught.visibility == "zbuffer"
+    ]
+
+
+def trees_among(data: Sequence[Path]) -> tuple[Path, ...]:
+    """Those of the sources that are data trees, on which a network can be trained."""
+    return tuple(root for root in data if (root / "data_list").is_dir())
+
+
+@torch.no_grad()
+def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> Scores:
+    """Figure -> (M,) of each shape's prediction from its first view in a seed's order, with one random code.
+
+    "cd_1", "pred_to_gt", "gt_to_pred" x100 against the whole shape; "visible" and "inside" as in validation;
+    "front_density": which share of the points lies where the view sees the surface, over the share of the true surface
+    that it sees (1: as dense as behind); "imbalance": which share of the points would have to move to another of 32
+    parts of the surface for all parts to be as dense (0 to 1).
+    """
+    generator = torch.Generator().manual_seed(seed)
+    codes = torch.randn(1, len(test), model.code_dim, generator=generator)
+    first = view_order(test, seed)[:, :1]
+    clouds = [
+        model(test.float_images(shapes, first[shapes])[:, 0], codes[:, shapes])[0]
+        for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE)
+    ]
+    return beside_the_truth(torch.cat(clouds), test, first)
+
+
+def beside_the_truth(clouds: Tensor, test: LoadedSplit, first: Tensor) -> Scores:
+    """The figures of `single_views` of clouds (M, N, 3), of which the views (M, 1) show something."""
+    parts: list[Scores] = []
+    for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
+        seen, truth, made = test.batch(shapes, first[shapes]), test.points[shapes], clouds[shapes]
+        errors = cloud_errors(made, truth)
+        parts.append(
+            {
+                "visible": visible_error(made, seen.camera, seen.depth)[:, 0],
+                "inside": in_silhouette(made, seen.camera, seen.depth).float().mean((1, 2)),
+                "cd_1": errors.cd,
+                "pred_to_gt": errors.pred_to_gt,
+                "gt_to_pred": errors.gt_to_pred,
+                **densities(made, truth, visible_points(truth, seen.camera, method="horizon")[:, 0]),
+            }
+        )
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def densities(clouds: Tensor, truth: Tensor, seen: Tensor) -> Scores:
+    """How evenly clouds (B, N, 3) lie on surfaces; see `single_views`.
+
+    Args:
+        clouds: (B, N, 3).
+        truth: (B, P, 3) evenly spread over the surface.
+        seen: (B, P) bool: does the view see this true point?
+    """
+    at = nearest(clouds, truth).index
+    true_share, share = seen.float().mean(1), seen.gather(1, at).float().mean(1)
+    centres = torch.take_along_dim(truth, farthest_point_sample(truth, _PARTS)[..., None], 1)
+    part = nearest(truth, centres).index
+    true_parts, parts = _histogram(part), _histogram(part.gather(1, at))
+    return {
+        "front_density": share / true_share.clamp(min=1e-6),
+        "imbalance": (parts - true_parts).abs().sum(1) / 2,
+    }
+
+
+def _histogram(part: Tensor) -> Tensor:
+    """(B, N) numbers of parts -> (B, _PARTS) shares."""
+    return torch.nn.functional.one_hot(part, _PARTS).float().mean(1)
+
+
+def study(bench: Workbench) -> dict[str, Any]:
+    """Trains and measures what is missing; what comes of it is for JSON.
+
+    Returns:
+        "single" and "many": for each loss of `TAUGHT` means and spreads over trainings after each stage, and the curves
+        of validation with a verdict for each training.
+    """
+    # On one core a training takes hardly longer than on two, and gives the same bits everywhere.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for config in configs(bench):
+            bench.train(config)
+    finally:
+        torch.set_num_threads(threads)
+    return {
+        "shapes": len(bench.scores(configs(bench)[0], _RANDOM, views=_VIEWS)["cd"]),
+        "seeds": bench.seeds,
+        "profile": bench.profile,
+        "floor": _floor(bench),
+        "single": {name: _single(bench, taught) for name, taught in TAUGHT.items()},
+        "many": {
+            name: _many(bench, taught) for name, taught in TAUGHT.items() if taught.visibility == "zbuffer"
+        },
+    }
+
+
+class Examples(NamedTuple):
+    """Held-out shapes, and what networks taught by each loss answer to one image of them after stage 1.
+
+    Attributes:
+        images: (M, 3, H, W) in [0, 1].
+        camera: (M,) theirs.
+        truth: (M, P, 3).
+        clouds: name in `TAUGHT` -> (M, N, 3).
+    """
+
+    images: Tensor
+    camera: PinholeCamera
+    truth: Tensor
+    clouds: dict[str, Tensor]
+
+
+@torch.no_grad()
+def examples(bench: Workbench, *, count: int = 3) -> Examples:
+    """Of the first training of each loss; the shapes are spread over the test split."""
+    clouds: dict[str, Tensor] = {}
+    for name, taught in TAUGHT.items():
+        config = bench.config(lambda c, t=taught: t.config(c, single=True), seed=0)
+        test = bench.split(config, "test")
+        shapes = torch.linspace(0, len(test) - 1, min(count, len(test))).long()
+        model = bench.network(config, stage=1)
+        seen = test.batch(shapes, torch.zeros(len(shapes), 1, dtype=torch.long))
+        codes = torch.randn(1, len(shapes), model.code_dim, generator=torch.Generator().manual_seed(0))
+        clouds[name] = model(seen.images[:, 0], codes)[0]
+    camera = PinholeCamera(
+        seen.camera.K[:, 0], seen.camera.cam_from_world[:, 0], seen.camera.height, seen.camera.width
+    )
+    return Examples(seen.images[:, 0], camera, test.points[shapes], clouds)
+
+
+def _floor(bench: Workbench) -> dict[str, float]:
+    """The figures of as many points of the true surface as a network predicts."""
+    config = configs(bench)[0]
+    test = bench.split(config, "test")
+    count = size_of(config).points
+    generator = torch.Generator().manual_seed(0)
+    some = torch.stack([torch.randperm(test.points.shape[1], generator=generator)[:count] for _ in test.ids])
+    clouds = test.clouds(torch.arange(len(test)), some)
+    return {
+        name: values.mean().item()
+        for name, values in beside_the_truth(clouds, test, view_order(test, 0)[:, :1]).items()
+    }
+
+
+def _single(bench: Workbench, taught: Taught) -> dict[str, Any]:
+    """A loss that began with single views: after stage 1 and after stage 2, curves, and whether it converged."""
+    runs = [bench.config(lambda c: taught.config(c, single=True), seed=seed) for seed in range(bench.seeds)]
+    return {
+        "steps": [runs[0].stage1.steps, runs[0].stage2.steps],
+        "stage1": _spread([_measured(bench, config, 1) for config in runs]),
+        "stage2": _spread([_measured(bench, config, 2) for config in runs]),
+        "curves": [_curve(bench, config, 1) for config in runs],
+    }
+
+
+def _many(bench: Workbench, taught: Taught) -> dict[str, Any]:
+    """A loss that saw all views from the first step."""
+    runs = [bench.config(lambda c: taught.config(c, single=False), seed=seed) for seed in range(bench.seeds)]
+    return {
+        "steps": [runs[0].stage2.steps],
+        "stage2": _spread([_measured(bench, config, 2) for config in runs]),
+        "curves": [_curve(bench, config, 2) for config in runs],
+    }
+
+
+def _measured(bench: Workbench, config: FitConfig, stage: Literal[1, 2]) -> dict[str, float]:
+    """Means over the test shapes: of single views, and of all views joined."""
+    alone = bench.measured(
+        config, "single views", lambda m, d: single_views(m, d, seed=config.seed), stage=stage
+    )
+    joined = bench.scores(config, _RANDOM, stage=stage, views=_VIEWS)
+    both = {**alone, "cd": joined["cd"], "fps_cd": joined["fps_cd"]}
+    return {name: values.mean().item() for name, values in both.items()}
+
+
+def _spread(by_seed: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Mean, standard deviation over trainings (None for one), and each training's own."""
+    values = {name: [found[name] for found in by_seed] for name in by_seed[0]}
+    return {
+        name: {
+            "mean": statistics.fmean(v),
+            "sd": statistics.stdev(v) if len(v) > 1 else None,
+            "by_seed": v,
+        }
+        for name, v in values.items()
+    }
+
+
+def _curve(bench: Workbench, config: FitConfig, stage: Literal[1, 2]) -> dict[str, Any]:
+    """What validation said on the way, from the fresh weights on; and whether it converged."""
+    fresh = bench.measured(
+        config,
+        "validation",
+        lambda m, d: {k: torch.tensor([v]) for k, v in validate(m, d, seed=config.seed).items()},
+        stage=0,
+        split="val",
+    )
+    records = [r for r in read_metrics(bench.train(config)) if r["stage"] == stage and "val_visible" in r]
+    before = sum(phase.steps for name, phase in config.phases.items() if STAGES[name] < stage)
+    steps = [0, *(record["step"] - before for record in records)]
+    curve = {
+        name: [fresh[f"val_{name}"].item(), *(record[f"val_{name}"] for record in records)]
+        for name in _CURVES
+    }
+    left, inside = curve["visible"][-1] / curve["visible"][0], curve["inside"][-1]
+    return {"step": steps, **curve, "left": left, "verdict": verdict(left, inside)}
+
+
+def verdict(left: float, inside: float) -> Verdict:
+    """Did a training converge?
+
+    Args:
+        left: its last validation's error of the visible part, as a share of the fresh network's.
+        inside: share of its points in the silhouette then.
+    """
+    if left >= 0.8 or inside < 0.5:
+        return "did not converge"
+    return "converged" if left < 0.3 else "in between"
