@@ -25,8 +25,7 @@ def bench(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Workbenc
     """With both systems trained, two seeds each."""
     out = tmp_path_factory.mktemp("bench")
     bench = Workbench((tiny_data,), out, "smoke", seeds=2, limit=4, steps=3, progress=False)
-    for config in DETERMINISTIC.configs(bench):
-        bench.train(config)
+    bench.train_all(DETERMINISTIC.configs(bench))
     return bench
 
 
@@ -171,3 +170,17 @@ def test_wrong_requests_are_named(bench: Workbench, tmp_path: Path) -> None:
         dataclasses.replace(bench, limit=1)
     with pytest.raises(UserError, match="no data at"):
         dataclasses.replace(bench, data=(tmp_path,)).run_of(bench.config(deterministic, seed=0))
+
+
+def test_trainings_side_by_side_have_the_same_bits(bench: Workbench, tmp_path: Path) -> None:
+    wanted = [bench.config(deterministic, seed=seed) for seed in (0, 1)]
+    beside = dataclasses.replace(bench, out=tmp_path, processes=2)
+    beside.train_all(wanted)
+    for config in wanted:
+        assert beside.is_trained(config)
+        for stage in (1, 2):
+            weights = best_weights(beside.run_of(config), stage).read_bytes()
+            assert weights == best_weights(bench.run_of(config), stage).read_bytes()
+    with pytest.raises(UserError, match="asks for"):
+        many = dataclasses.replace(wanted[0], stage2=dataclasses.replace(wanted[0].stage2, views=9))
+        beside.train_all([many, dataclasses.replace(many, seed=1)])

@@ -10,6 +10,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import dataclasses
 import itertools
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -204,6 +205,8 @@ class Experiment:
     """Use at most that many test shapes."""
     steps: int | None = None
     """The same number of steps for every phase, for a quick look."""
+    processes: int | None = None
+    """Trainings at once, with one core each; as many as there are cores if not given."""
     run_: Annotated[Path | None, arg(name="run")] = None
     """agreement: the run it is about, a .safetensors file of one, or the word `pretrained`; trained if not given."""
     views: int = 8
@@ -212,7 +215,10 @@ class Experiment:
     def run(self) -> None:
         from train.experiments import Workbench, run_experiment
 
-        bench = Workbench(self.data, self.out, self.profile, self.seeds, self.limit, self.steps)
+        processes = os.cpu_count() or 1 if self.processes is None else self.processes
+        bench = Workbench(
+            self.data, self.out, self.profile, self.seeds, self.limit, self.steps, processes=processes
+        )
         run_experiment(self.name, bench, run=self.run_, views=self.views)
 
 

@@ -180,14 +180,7 @@ def study(bench: Workbench) -> dict[str, Any]:
         "single" and "many": for each loss of `TAUGHT` means and spreads over trainings after each stage, and the curves
         of validation with a verdict for each training.
     """
-    # On one core a training takes hardly longer than on two, and gives the same bits everywhere.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        for config in configs(bench):
-            bench.train(config)
-    finally:
-        torch.set_num_threads(threads)
+    bench.train_all(configs(bench))
     return {
         "shapes": len(bench.scores(configs(bench)[0], _RANDOM, views=_VIEWS)["cd"]),
         "seeds": bench.seeds,

@@ -113,8 +113,7 @@ def make(table: Table, bench: Workbench) -> dict[str, Any]:
     Returns:
         What NAME.json holds.
     """
-    for config in table.configs(bench):
-        bench.train(config)
+    bench.train_all(table.configs(bench))
     scores = {
         row.name: _stacked([row.scores(bench, seed=seed) for seed in range(bench.seeds)])
         for row in table.rows

@@ -24,6 +24,7 @@ from train.batches import LoadedSplit
 from train.checkpoint import best_weights, load_predictor
 from train.config import PROFILES, FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
 from train.errors import UserError
+from train.experiments.side_by_side import run_side_by_side
 from train.files import replacing, write_text
 from train.fit import fit
 from train.runs import read_split
@@ -60,6 +61,7 @@ class Workbench:
         limit: score at most that many test shapes.
         steps: if given, the same number of steps for every phase, for a quick look.
         progress: show bars.
+        processes: how many trainings at once, each in a process with one thread.
     """
 
     data: tuple[Path, ...]
@@ -69,6 +71,7 @@ class Workbench:
     limit: int | None = None
     steps: int | None = None
     progress: bool = True
+    processes: int = 1
     _loaded: dict[tuple, LoadedSplit] = dataclasses.field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -76,6 +79,8 @@ class Workbench:
             raise UserError(f"--seeds must be at least 1; got {self.seeds}")
         if self.limit is not None and self.limit < 2:
             raise UserError(f"--limit must be at least 2, for a spread over shapes; got {self.limit}")
+        if self.processes < 1:
+            raise UserError(f"--processes must be at least 1; got {self.processes}")
 
     def config(self, change: Change, *, seed: int) -> FitConfig:
         """The profile's configuration with a variant's changes."""
@@ -112,6 +117,28 @@ class Workbench:
         seconds = round(time.monotonic() - start)
         write_text(run / "trained.json", json.dumps({"seconds": seconds, "continued": begun}) + "\n")
         return run
+
+    def train_all(self, configs: Sequence[FitConfig]) -> None:
+        """Trains what is not yet trained, `processes` at once. A training has the same bits whichever way it is made.
+
+        Raises:
+            KeyboardInterrupt: as `train`.
+            UserError: one could not be trained; the others that were under way have come to their end.
+        """
+        missing = [config for config in configs if not self.is_trained(config)]
+        processes = min(self.processes, len(missing))
+        if processes > 1:
+            quiet = dataclasses.replace(self, progress=False, processes=1)
+            calls = [(quiet, config) for config in missing]
+            run_side_by_side(_train, calls, processes=processes, title="trainings", progress=self.progress)
+            return
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            for config in missing:
+                self.train(config)
+        finally:
+            torch.set_num_threads(threads)
 
     def scores(
         self,
@@ -245,6 +272,10 @@ class Workbench:
 def as_it_is(config: FitConfig) -> FitConfig:
     """The change that changes nothing: our own system as the profile has it."""
     return config
+
+
+def _train(bench: Workbench, config: FitConfig) -> None:
+    bench.train(config)
 
 
 def _digest(text: str) -> str:
