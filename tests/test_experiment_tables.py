@@ -172,6 +172,7 @@ def test_wrong_requests_are_named(bench: Workbench, tmp_path: Path) -> None:
         dataclasses.replace(bench, data=(tmp_path,)).run_of(bench.config(deterministic, seed=0))
 
 
+@pytest.mark.slow
 def test_trainings_side_by_side_have_the_same_bits(bench: Workbench, tmp_path: Path) -> None:
     wanted = [bench.config(deterministic, seed=seed) for seed in (0, 1)]
     beside = dataclasses.replace(bench, out=tmp_path, processes=2)

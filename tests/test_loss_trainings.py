@@ -27,6 +27,7 @@ from train.systems import build_network
 INFINITY = float("inf")
 
 
+@pytest.mark.slow
 def test_the_whole_study_trains_measures_and_resumes(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
