@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
 
 from diffpoint import PinholeCamera, diversity_loss, unproject
+from diffpoint.visibility import METHODS
 from train.config import (
     EXACT_MEAN_EMD_FROM_PAPER,
     PROFILES,
+    Visibility,
     fit_config_from_json,
     scaled,
     to_json,
@@ -103,6 +106,10 @@ def test_full_profile_holds_the_papers_numbers() -> None:
 def test_the_deterministic_counterpart_diversifies_nothing() -> None:
     for stage in dataclasses.replace(PROFILES["cpu"], deterministic=True).stages:
         assert (stage.codes, stage.beta) == (1, 0)
+
+
+def test_configurations_know_every_way_to_tell_what_a_camera_sees() -> None:
+    assert get_args(Visibility) == METHODS
 
 
 @pytest.mark.parametrize("profile", ["full", "cpu", "smoke"])

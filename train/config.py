@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from diffpoint.visibility import Method as Visibility
 from train.errors import UserError
 
 if TYPE_CHECKING:
@@ -26,6 +25,8 @@ Variant = Literal["standard", "highly-diverse"]
 Ending = Literal["points", "latent"]
 Precision = Literal["float32", "bfloat16"]
 Supervision = Literal["front", "projection", "lin", "soft"]
+# The methods of `diffpoint.visible_points`, whose import would load torch; a test compares them.
+Visibility = Literal["zbuffer", "radius", "pyramid", "cone", "horizon", "hpr"]
 System = Literal["ours", "psgn", "psgn-mon", "front-mon", "lin", "r2n2", "ptn"]
 
 # The paper's alpha multiplies the released code's approximate EMD: a sum over 2048 points, about 1.3 times
