@@ -8,10 +8,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +28,11 @@ from benchmarks.visibility_shapes import (
     procedural_scenes,
 )
 from diffpoint.visibility import METHODS, Method
+from train.experiments.hidden_points import quality
+from train.experiments.runtime import COUNTS, PAPER, medians
 
 SIZES = (28, 32, 40, 56, 112, 224)
-COUNTS = (2048, 10_000)
 HEADLINE = 56
-PAPER = {2048: {"hidden": 0.104, "ms": 6.6}, 10_000: {"hidden": 0.036, "ms": 10.2}}
-"""What the paper says of its z-buffer on a GPU, per number of points."""
 MARK = {"hidden": 0.05, "recall": 0.75, "ratio": 3.0}
 SWEEPS: dict[Method, tuple[str, tuple[float, ...]]] = {
     "radius": ("tolerance", (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)),
@@ -108,28 +106,6 @@ def gather(meshes: Path | None, per_category: int) -> list[Scene]:
     return scenes + list(procedural_scenes(range(5), COUNTS))
 
 
-def quality(
-    scenes: Sequence[Scene],
-    count: int,
-    size: int,
-    method: Method,
-    *,
-    radius: float | None = None,
-    tolerance: float | None = None,
-) -> dict[str, float]:
-    """Mean hidden share and recall over all views of all scenes."""
-    hidden_share, recall = [], []
-    for scene in scenes:
-        camera = scene.camera.resize(size, size)
-        kept = dp.visible_points(
-            scene.clouds[count][None], camera, method=method, radius=radius, tolerance=tolerance
-        )[0]
-        hidden = scene.hidden[count]
-        hidden_share.append((kept & hidden).sum(1) / kept.sum(1).clamp(min=1))
-        recall.append((kept & ~hidden).sum(1) / (~hidden).sum(1).clamp(min=1))
-    return {"hidden": float(torch.cat(hidden_share).mean()), "recall": float(torch.cat(recall).mean())}
-
-
 def categories(scenes: Sequence[Scene]) -> list[dict[str, Any]]:
     """The headline row for each category."""
     return [
@@ -157,7 +133,7 @@ def times(scenes: Sequence[Scene], count: int, clouds: int = 10) -> list[dict[st
             return lambda: dp.visible_points(points[:1], camera[0], method=method)
         return lambda: dp.visible_points(points, camera, method=method)
 
-    milliseconds = _medians({m: run(m) for m in METHODS}, rounds=15)
+    milliseconds = medians({m: run(m) for m in METHODS}, rounds=15, clock=time.process_time)
     per_view = {m: ms / (camera.batch_shape[1] if m == "hpr" else views) for m, ms in milliseconds.items()}
     return [
         {"points": count, "method": m, "ms": ms, "ratio": ms / per_view["zbuffer"]}
@@ -172,22 +148,8 @@ def single_times(scenes: Sequence[Scene], count: int) -> list[dict[str, Any]]:
     def run(method: Method) -> Callable[[], Any]:
         return lambda: dp.visible_points(points, camera, method=method)
 
-    medians = _medians({m: run(m) for m in METHODS}, rounds=31, clock=time.perf_counter)
-    return [{"points": count, "method": m, "ms": ms} for m, ms in medians.items()]
-
-
-def _medians(
-    runs: Mapping[Method, Callable[[], Any]], *, rounds: int, clock: Callable[[], float] = time.process_time
-) -> dict[Method, float]:
-    durations: dict[Method, list[float]] = {m: [] for m in runs}
-    for run in runs.values():
-        run()
-    for _ in range(rounds):
-        for method, run in runs.items():
-            start = clock()
-            run()
-            durations[method].append(1e3 * (clock() - start))
-    return {m: statistics.median(d) for m, d in durations.items()}
+    milliseconds = medians({m: run(m) for m in METHODS}, rounds=31)
+    return [{"points": count, "method": m, "ms": ms} for m, ms in milliseconds.items()]
 
 
 def report(result: dict[str, Any]) -> str:
@@ -228,7 +190,7 @@ def report(result: dict[str, Any]) -> str:
         lines += [
             f"| the paper, on a GPU | {_percent(paper['hidden'])} hidden"
             + " |" * len(SIZES)
-            + f" | {paper['ms']} |",
+            + f" | {paper['zbuffer']} |",
             "",
         ]
     lines += [

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-import diffpoint as dp
 from train.data.categories import category_of
-from train.data.embree import load_embree
 from train.data.meshes import MeshError, load_surface
-from train.data.procedural import variants_of
-from train.data.render import draw_camera
-from train.data.solids import sample_union, surface_of
 from train.data.sources import find_meshes, keep_labelled, read_labels
 from train.data.surface import Surface, sample_triangles
+from train.experiments.hidden_points import EPSILON, Rays, Scene, embedded_scene, make_scene
 
 FURNITURE = Path("/usr/share/sweethome3d/furniture")
 LABELS = Path(__file__).parents[1] / "train/data/furniture_labels.csv"
@@ -28,20 +21,7 @@ MEASURED = ("BlendSwap-CC-0.sh3f", "BlendSwap-CC-BY.sh3f")
 """The libraries that methods are compared on; other libraries, by other authors, fit the filters."""
 FITTED = ("KatorLegaz.sh3f", "Scopia.sh3f")
 CATEGORIES = ("chair", "table", "sofa", "cabinet", "lamp")
-EPSILON = 0.002  # what hides a point lies at least so far before it; the shapes' diagonal is 1
 _DIRECTIONS = 48  # from which a point must be seen at least once, or it is inside the shape
-VIEWS = 8
-
-
-@dataclasses.dataclass(frozen=True)
-class Scene:
-    """One shape: clouds by their number of points, its cameras (V,), and what is hidden (V, N) in each."""
-
-    name: str
-    category: str
-    camera: dp.PinholeCamera
-    clouds: dict[int, Tensor]
-    hidden: dict[int, Tensor]
 
 
 def mesh_scenes(sources: Sequence[Path], counts: Sequence[int], *, per_category: int) -> Iterator[Scene]:
@@ -60,30 +40,14 @@ def mesh_scenes(sources: Sequence[Path], counts: Sequence[int], *, per_category:
                     surface = load_surface(mesh.path, mesh.rotation)
                 except MeshError:
                     continue
-                yield _scene(mesh.inside, category, surface, counts)
+                sample = functools.partial(_sample_outside, surface, Rays(surface))
+                yield make_scene(mesh.inside, category, surface, counts, sample)
 
 
 def procedural_scenes(seeds: Sequence[int], counts: Sequence[int]) -> Iterator[Scene]:
     for seed in seeds:
         for category in ("chair", "display"):
-            variants = variants_of(category, seed)
-            solids = variants[seed % len(variants)]
-            yield _scene(f"seed {seed}", f"procedural {category}", surface_of(solids), counts, solids)
-
-
-def _scene(
-    name: str, category: str, surface: Surface, counts: Sequence[int], solids: list | None = None
-) -> Scene:
-    rng = np.random.default_rng(len(surface.faces))
-    rays = Rays(surface)
-    camera = draw_camera(rng, VIEWS, 224)
-    clouds, hidden = {}, {}
-    for count in counts:
-        points = sample_union(solids, count, rng) if solids else _sample_outside(surface, rays, count, rng)
-        eyes = camera.position.double().numpy()
-        clouds[count] = torch.from_numpy(points).float()
-        hidden[count] = torch.from_numpy(np.stack([rays.blocked(eye, points) for eye in eyes]))
-    return Scene(name, category, camera.to(dtype=torch.float32), clouds, hidden)
+            yield embedded_scene(category, seed, counts)
 
 
 def _sample_outside(surface: Surface, rays: Rays, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -98,28 +62,6 @@ def _sample_outside(surface: Surface, rays: Rays, count: int, rng: np.random.Gen
         points, _ = sample_triangles(surface.vertices[surface.faces], 4 * count, rng)
         unseen = np.ones(len(points), bool)
         for eye in eyes:
-            unseen[unseen] = rays.blocked(eye, points[unseen])
+            unseen[unseen] = rays.behind(eye, points[unseen]) > EPSILON
         kept.append(points[~unseen])
     return np.concatenate(kept)[:count]
-
-
-class Rays:
-    """Ray casting against one surface."""
-
-    def __init__(self, surface: Surface) -> None:
-        rtcore_scene, mesh_construction = load_embree()
-        self._scene: Any = rtcore_scene.EmbreeScene()
-        mesh_construction.TriangleMesh(
-            scene=self._scene,
-            vertices=np.ascontiguousarray(surface.vertices, np.float32),
-            indices=np.ascontiguousarray(surface.faces, np.int32),
-        )
-
-    def blocked(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """(N,): the segment from the eye to the point meets the surface more than EPSILON before its end."""
-        way = points - eye
-        length = np.linalg.norm(way, axis=1)
-        directions = (way / np.maximum(length, 1e-9)[:, None]).astype(np.float32)
-        origins = np.broadcast_to(eye.astype(np.float32), directions.shape).copy()
-        hits = self._scene.run(origins, directions, output=True)
-        return (hits["primID"] >= 0) & (hits["tfar"] < length - EPSILON)

@@ -15,7 +15,7 @@ author = "the diffpoint authors"
 release = diffpoint.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "results"]  # results.md is made of what stands in there
 html_theme = "furo"
 html_title = "diffpoint"
 nitpicky = False

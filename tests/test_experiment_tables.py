@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,11 +14,22 @@ import torch
 from models import build_generator
 from models.parts import prepare_images
 from train.checkpoint import best_weights
+from train.config import FitConfig
 from train.errors import UserError
 from train.experiments import Workbench, run_experiment
 from train.experiments.health import VARIANTS
-from train.experiments.paper import DETERMINISTIC, TABLES, deterministic, with_critic
-from train.experiments.table import Expectation, Row, Table, confidence, make
+from train.experiments.paper import (
+    DETERMINISTIC,
+    TABLES,
+    deterministic,
+    of_system,
+    second_stage_alone,
+    second_stage_without_diversity,
+    with_critic,
+    without_critic,
+)
+from train.experiments.table import Row, Table, below, confidence, make, markdown
+from train.experiments.workbench import parts_of, stage1_of
 from train.log import read_metrics
 
 
@@ -47,7 +60,7 @@ def test_a_table_is_what_was_measured_and_is_made_once(bench: Workbench) -> None
     row = result["rows"]["conditional"]
     assert row["mean"]["cd"] == pytest.approx(sum(row["by_seed"]["cd"]) / 2)
     assert row["by_seed"]["cd"][0] != row["by_seed"]["cd"][1]
-    expected = result["expectations"][0]
+    expected = result["claims"][0]
     assert expected["gain"] == pytest.approx(
         result["rows"]["deterministic"]["mean"]["cd"] - row["mean"]["cd"]
     )
@@ -61,15 +74,103 @@ def test_a_table_is_what_was_measured_and_is_made_once(bench: Workbench) -> None
     assert after == before
 
 
+@pytest.mark.parametrize(
+    "name", ["diversity", "single-category", "multi-category", "ablation", "consistency"]
+)
+def test_every_table_of_the_paper_can_be_made(
+    name: str, tiny_data: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    out = tmp_path_factory.getbasetemp() / "tables"  # shared: what one table trains, the next one has
+    bench = Workbench((tiny_data,), out, "smoke", seeds=1, limit=4, steps=2, progress=False)
+    table = TABLES[name]
+    result = make(table, bench)
+    assert list(result["rows"]) == [row.name for row in table.rows]
+    for row in result["rows"].values():
+        assert all(math.isfinite(value) for value in row["mean"].values())
+    text = (out / f"{name}.md").read_text()
+    assert text == markdown(json.loads((out / f"{name}.json").read_text()))
+    assert all(claim.words in text for claim in table.claims)
+    kinds = set(bench.split(table.config(table.rows[-1], bench, seed=0), "test").categories)
+    assert kinds == ({"chair"} if table.of_one_category else {"chair", "display"})
+    if table.category_claims:
+        of_categories = result["categories"].values()
+        weighted = sum(each["shapes"] * each["rows"]["ours"]["cd"] for each in of_categories)
+        assert weighted / result["shapes"] == pytest.approx(result["rows"]["ours"]["mean"]["cd"])
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=lambda table: table.name)
+def test_what_is_claimed_holds_for_the_papers_own_figures(table: Table) -> None:
+    paper = {row.name: row.paper for row in table.rows}
+    for claim in (*table.claims, *table.category_claims):
+        try:
+            gain = claim.gain(paper)
+        except KeyError:  # no figure of the paper's
+            continue
+        assert gain > 0, claim.words
+
+
+def test_trainings_share_their_first_stage(bench: Workbench) -> None:
+    config = bench.config(without_critic, seed=0)
+    variant = second_stage_without_diversity(config)
+    first, whole = parts_of(config)
+    assert (first.stage1, first.stage2.steps) == (config.stage1, 0)
+    assert whole == config
+    assert parts_of(stage1_of(variant)) == (first,)
+    bench.train_all([config, variant])
+    runs = {bench.run_of(part).name for part in (first, config, variant)}
+    assert len(runs) == 3
+    assert bench.train(config, stage=1) == bench.train(variant, stage=1) == bench.run_of(first)
+    weights = best_weights(bench.run_of(first), 1)
+    for each in (config, variant):
+        saved = json.loads((bench.run_of(each) / "config.json").read_text())
+        assert (saved["start"], saved["stage1"]["steps"]) == (str(weights), 0)
+        assert not best_weights(bench.run_of(each), 1).exists()
+    same, other = (bench.network(each, stage=1) for each in (config, variant))
+    assert all(torch.equal(a, b) for a, b in zip(same.parameters(), other.parameters(), strict=True))
+    # A critic goes on learning, and a first stage that is missing or the only one cannot be parted.
+    alone = second_stage_alone(config)
+    for whole in (bench.config(with_critic, seed=0), alone, bench.config(of_system("psgn"), seed=0)):
+        assert parts_of(whole) == (whole,)
+
+
 def test_tables_share_what_is_trained(bench: Workbench) -> None:
     runs = set((bench.out / "runs").iterdir())
-    assert len(runs) == len(DETERMINISTIC.configs(bench)) == 6
-    made = make(TABLES["stages"], bench)
+    wanted = {bench.run_of(part) for config in DETERMINISTIC.configs(bench) for part in parts_of(config)}
+    assert wanted <= runs
+    made = make(TABLES["views"], bench)
     assert set((bench.out / "runs").iterdir()) == runs
-    agreed = made["rows"]["stages 1 and 2, agreed codes"]
+    agreed = made["rows"]["4 views"]
     assert agreed["consistency"]["descended"] < agreed["consistency"]["searched"]
     other = dataclasses.replace(bench, steps=2)
-    assert not any(other.is_trained(config) for config in TABLES["stages"].configs(other))
+    assert not any(other.is_trained(config) for config in TABLES["views"].configs(other))
+
+
+def test_scores_outlive_their_runs(bench: Workbench, tmp_path: Path) -> None:
+    shutil.copytree(bench.out / "scores", tmp_path / "scores")
+    elsewhere = dataclasses.replace(bench, out=tmp_path)
+    table = dataclasses.replace(TABLES["deterministic"], claims=())
+    first = make(table, bench)
+    assert make(table, elsewhere) == first
+    assert not (tmp_path / "runs").exists()
+    for path in (tmp_path / "scores").iterdir():
+        path.unlink()
+    seeds = [config.seed for config in table.missing(elsewhere)]
+    assert seeds == [config.seed for config in table.configs(elsewhere)]
+    config = bench.config(deterministic, seed=0)
+    assert elsewhere.needs_training(lambda asked: asked.scores(config, config.inference, views=2))
+    assert not bench.needs_training(lambda asked: asked.scores(config, config.inference, views=2))
+
+
+def test_a_new_field_of_the_configuration_renames_no_run(bench: Workbench) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Later(FitConfig):
+        invented: int = 7
+
+    config = bench.config(deterministic, seed=0)
+    later = Later(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
+    assert bench.run_of(later) == bench.run_of(config)
+    assert bench.run_of(dataclasses.replace(later, invented=8)) != bench.run_of(config)
+    assert bench.run_of(dataclasses.replace(config, map_size=8)) != bench.run_of(config)
 
 
 def test_an_interrupted_training_is_finished_to_the_same_weights(bench: Workbench) -> None:
@@ -106,13 +207,11 @@ def test_confidence_is_the_share_of_samples_with_a_gain() -> None:
 
 def test_a_verdict_says_what_the_numbers_say(bench: Workbench) -> None:
     rows = (Row(name="network", views=4), Row(name="medoid", answer="medoid", views=4))
-    pairs = (Expectation("cd", "medoid", "network"), Expectation("cd", "network", "medoid"))
-    found = make(
-        Table(name="try", title="Untrained beside the medoid.", rows=rows, expectations=pairs), bench
-    )
-    verdicts = [expectation["verdict"] for expectation in found["expectations"]]
+    pairs = (below("cd", "medoid", "network"), below("cd", "network", "medoid"))
+    found = make(Table(name="try", title="Untrained beside the medoid.", rows=rows, claims=pairs), bench)
+    verdicts = [claim["verdict"] for claim in found["claims"]]
     assert verdicts in (["holds", "does not hold"], ["does not hold", "holds"], ["undecided", "undecided"])
-    gains = [expectation["gain"] for expectation in found["expectations"]]
+    gains = [claim["gain"] for claim in found["claims"]]
     assert gains[0] == pytest.approx(-gains[1])
     assert (gains[0] > 0) == (verdicts[0] == "holds") or verdicts[0] == "undecided"
 

@@ -19,7 +19,7 @@ from train.errors import UserError
 from train.experiments import Workbench
 from train.experiments.free_clouds import LOSSES
 from train.experiments.front_vs_projection import front_vs_projection
-from train.experiments.loss_trainings import TAUGHT, configs, densities, trees_among, verdict
+from train.experiments.loss_trainings import TAUGHT, configs, densities, verdict
 from train.metrics import in_silhouette, visible_error
 from train.objective import Scene, supervise
 from train.systems import build_network
@@ -79,7 +79,8 @@ def test_trainings_differ_in_their_loss_alone() -> None:
 
 
 def test_only_trees_are_trained_on(tiny_data: Path, tmp_path: Path) -> None:
-    assert trees_among((tmp_path, tiny_data)) == (tiny_data,)
+    bench = Workbench((tmp_path, tiny_data, tmp_path / "mesh.obj"), tmp_path)
+    assert bench.on_trees().data == (tiny_data,)
 
 
 def test_even_clouds_are_even_and_crowded_fronts_are_seen() -> None:

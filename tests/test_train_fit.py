@@ -21,7 +21,7 @@ import torch
 from train import state as state_module
 from train.__main__ import main
 from train.batches import load_split
-from train.checkpoint import latest_checkpoint, load_generator
+from train.checkpoint import best_weights, latest_checkpoint, load_generator
 from train.config import PROFILES, Precision, fit_config_from_json
 from train.errors import UserError
 from train.fit import fit
@@ -217,6 +217,41 @@ def test_the_highly_diverse_model_from_the_command_line(
         3,
     )
     assert [r["stage"] for r in read_metrics(run)] == [1, 1, 1, 2, 2, 2]
+
+
+def test_a_training_starts_with_the_weights_of_another(
+    tiny_data: Path, smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = dataclasses.replace(
+        _SMOKE,
+        start=str(best_weights(smoke_run, 1)),
+        stage1=dataclasses.replace(_SMOKE.stage1, steps=0),
+        stage2=dataclasses.replace(_SMOKE.stage2, steps=2, gamma=0.0),
+    )
+    split = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, progress=False)
+    training = Training(config, split)
+    fresh = [p.clone() for p in training.learner.generator.parameters()]
+    training.begin_phase("stage2", tmp_path)
+    saved = load_generator(best_weights(smoke_run, 1)).parameters()
+    assert all(torch.equal(a, b) for a, b in zip(training.learner.generator.parameters(), saved, strict=True))
+    assert not all(
+        torch.equal(a, b) for a, b in zip(training.learner.generator.parameters(), fresh, strict=True)
+    )
+    # From the command line; and another network's weights are refused by name.
+    fit_it = [
+        "fit",
+        "--data",
+        str(tiny_data),
+        "--profile",
+        "smoke",
+        "--steps",
+        "2",
+        "--start",
+        str(smoke_run),
+    ]
+    assert main([*fit_it, "--out", str(tmp_path / "same")]) == 0
+    assert main([*fit_it, "--out", str(tmp_path / "other"), "--deterministic"]) == 2
+    assert "holds the weights of another network" in capsys.readouterr().err
 
 
 def test_resuming_a_finished_run_changes_nothing(tiny_data: Path, smoke_run: Path) -> None:

@@ -23,6 +23,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from train.config import PROFILES, FitConfig, System, fit_config_from_json, with_steps, with_variant
 from train.data_commands import Data
 from train.errors import UserError
+from train.questions import ABOUT_ALL, QUESTIONS
 from train.recipes import with_system
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
@@ -149,54 +150,39 @@ class Evaluate:
         )
 
 
-@dataclasses.dataclass
-class Experiment:
-    """Answer one question by measurement; writes NAME.json, NAME.md and NAME.png into --out.
+def _questions() -> str:
+    everything = {**QUESTIONS, **ABOUT_ALL}.items()
+    lines = "\n\n".join(f"{name}: {words}{'' if words[-1] in '?)' else '.'}" for name, words in everything)
+    return f"""Answer one question by measurement; writes NAME.json, NAME.md and NAME.png into --out.
 
     Trains what it needs, once for all experiments that write to the same place, and goes on where it was stopped.
 
-    deterministic: our system beside its counterpart without codes.
+    {lines.replace(chr(10), chr(10) + "    ")}
 
-    critic: with the latent critic and without.
-
-    stages: what stage 2, search and descent add.
-
-    views: the error from 1 to 8 images.
-
-    agreement: search and descent in detail: step sizes, steps, groups and restraints.
-
-    correlation: does disagreement tell the error, over shapes and over groups of codes?
-
-    predictions: several codes for one image: do they differ where the image does not tell?
-
-    coverage: do the codes reach all backs that a front can have, and is anything drawn that is none of them?
-
-    health: which choices keep a network listening to its image.
-
-    front-vs-projection: free clouds moved by the front constraint and by projection losses. Besides trees, --data takes
-    meshes as `data meshes` does; --limit counts shapes of each kind, at most 3.
+    front-vs-projection: besides trees, --data takes meshes as `data meshes` does; --limit counts shapes of each kind,
+    at most 3.
     """
 
-    name: Positional[
-        Literal[
-            "deterministic",
-            "critic",
-            "stages",
-            "views",
-            "agreement",
-            "correlation",
-            "predictions",
-            "coverage",
-            "health",
-            "front-vs-projection",
-        ]
+
+@dataclasses.dataclass
+class Experiment:
+    name: Annotated[
+        Positional[str],
+        PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="NAME",
+            choices=tuple(QUESTIONS | ABOUT_ALL),
+            instance_from_str=lambda words: words[0],
+            is_instance=lambda value: isinstance(value, str),
+            str_from_instance=lambda value: [value],
+        ),
     ]
     """Which one."""
-    data: tuple[Path, ...]
-    """Root of a data tree; several are put together for training, and the first one's test split is scored (health:
-    each on its own)."""
     out: Path
     """Directory to write to."""
+    data: tuple[Path, ...] = ()
+    """Root of a data tree; several are put together for training, and the first one's test split is scored (health:
+    each on its own)."""
     profile: Literal["full", "cpu", "smoke"] = "cpu"
     """Size of the networks, and how they are trained."""
     seeds: int = 3
@@ -207,19 +193,34 @@ class Experiment:
     """The same number of steps for every phase, for a quick look."""
     processes: int | None = None
     """Trainings at once, with one core each; as many as there are cores if not given."""
+    category: str = "chair"
+    """What single-category is about."""
+    pictures: Path | None = None
+    """photos: a folder with a folder of pictures for each object."""
     run_: Annotated[Path | None, arg(name="run")] = None
     """agreement: the run it is about, a .safetensors file of one, or the word `pretrained`; trained if not given."""
     views: int = 8
     """agreement: views per shape."""
 
     def run(self) -> None:
-        from train.experiments import Workbench, run_experiment
+        from train.experiments import Workbench, run_all, run_experiment, show_all, write_page
 
         processes = os.cpu_count() or 1 if self.processes is None else self.processes
         bench = Workbench(
-            self.data, self.out, self.profile, self.seeds, self.limit, self.steps, processes=processes
-        )
-        run_experiment(self.name, bench, run=self.run_, views=self.views)
+            self.data, self.out, self.profile, self.seeds, self.limit, self.steps,
+            processes=processes, category=self.category, pictures=self.pictures,
+        )  # fmt: skip
+        if self.name == "list":
+            show_all(bench)
+        elif self.name == "all":
+            run_all(bench)
+        elif self.name == "page":
+            print(f"wrote {write_page(self.out)}")
+        else:
+            run_experiment(self.name, bench, run=self.run_, views=self.views)
+
+
+Experiment.__doc__ = _questions()
 
 
 @dataclasses.dataclass

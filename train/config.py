@@ -195,6 +195,8 @@ class FitConfig:
     processor can multiply such numbers (avx512_bf16, amx; see lscpu), slower elsewhere."""
     autoencoder: str | None = None
     """A run, or a .safetensors file of one, whose auto-encoder is used instead of training one."""
+    start: str | None = None
+    """A run, or a .safetensors file of one, with whose weights the generator starts instead of fresh ones."""
     categories: tuple[str, ...] = ()
     """Categories to train on; none means all."""
     deterministic: bool = False

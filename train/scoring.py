@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from diffpoint import consistency_loss
+from diffpoint import chamfer_distance, consistency_loss
 from models import Generator, Predictor
 from train.batches import LoadedSplit
 from train.config import InferenceConfig
@@ -124,6 +124,29 @@ def diversity(model: Generator, test: LoadedSplit, *, codes: int, seed: int) -> 
         clouds = model(test.float_images(shapes, first[shapes])[:, 0], drawn)
         found.append(100 * consistency_loss(clouds.transpose(0, 1), reduction="none"))
     return torch.cat(found)
+
+
+@torch.no_grad()
+def novelty(model: Generator, test: LoadedSplit, shapes: Tensor, *, seed: int) -> Tensor:
+    """(M,) chamfer distance x100 from the prediction of one image, with a random code, to the nearest of some shapes.
+
+    Args:
+        model: takes codes.
+        test: the split whose images are shown.
+        shapes: (K, P, 3) true surfaces; as many points of each as the model predicts are used.
+        seed: draws views and codes.
+    """
+    first = view_order(test, seed)[:, :1]
+    generator = torch.Generator().manual_seed(seed)
+    among = shapes[:, : model.points].contiguous()
+    found = []
+    for numbers in torch.arange(len(test)).split(SHAPES_AT_ONCE):
+        codes = torch.randn(1, len(numbers), model.code_dim, generator=generator)
+        clouds = model(test.float_images(numbers, first[numbers])[:, 0], codes)[0]
+        for cloud in clouds:
+            distance = chamfer_distance(cloud.expand(len(among), -1, -1).contiguous(), among, squared=False)
+            found.append(100 * (distance.a_to_b + distance.b_to_a).amin())
+    return torch.stack(found)
 
 
 def view_order(test: LoadedSplit, seed: int) -> Tensor:

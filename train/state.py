@@ -71,12 +71,25 @@ class Training:
         """A fresh optimiser, from the best weights of the phases before; the critic goes on as it is."""
         self._world.wait()  # until whoever writes has written them
         self._enter(name)
+        first = next(phase for phase in (*self.config.phases, None) if phase != "autoencoder")
+        if self.config.start and name == first:
+            self._take_weights(Path(self.config.start))
         if name == "stage1" and self.config.needs_autoencoder:
             self._take_autoencoder(run)
             if self.learner.generator.ends_in_latent:
                 self.learner.generator.adopt_decoder(self.learner.autoencoder)
         if name == "stage2" and "stage1" in self.config.phases:
-            self.learner.generator.load_state_dict(load_predictor(best_weights(run, 1)).state_dict())
+            self._take_weights(best_weights(run, 1))
+
+    def _take_weights(self, run_or_file: Path) -> None:
+        found = load_predictor(run_or_file)
+        try:
+            self.learner.generator.load_state_dict(found.state_dict())
+        except RuntimeError:
+            raise UserError(
+                f"{run_or_file} holds the weights of another network than the one to be trained (--system, --profile, "
+                "--ending, --deterministic); start from one of the same kind"
+            ) from None
 
     def _take_autoencoder(self, run: Path) -> None:
         found = load_autoencoder(best_weights(run, "autoencoder"))

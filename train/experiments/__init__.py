@@ -2,42 +2,61 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from train.config import FitConfig
 from train.errors import UserError
+from train.experiments import coverage, loss_trainings
 from train.experiments.agreement import agreement
 from train.experiments.correlation import correlation
-from train.experiments.coverage import coverage
 from train.experiments.critic import critic
 from train.experiments.front_vs_projection import front_vs_projection
 from train.experiments.health import health
+from train.experiments.ledger import Experiment, answer, answer_all, list_lines, overview
+from train.experiments.page import write_page
 from train.experiments.paper import TABLES
 from train.experiments.predictions import predictions
-from train.experiments.table import make
-from train.experiments.workbench import Workbench
+from train.experiments.runtime import runtime
+from train.experiments.table import Table, make
+from train.experiments.workbench import Workbench, as_it_is
+from train.questions import QUESTIONS
 
-__all__ = ["EXPERIMENTS", "Workbench", "run_experiment"]
+__all__ = ["EXPERIMENTS", "Workbench", "run_all", "run_experiment", "show_all", "write_page"]
 
 
-def _about_a_run(bench: Workbench, run: Path | None, views: int) -> dict[str, Any]:
+def _ours(bench: Workbench) -> list[FitConfig]:
+    return [bench.config(as_it_is, seed=seed) for seed in range(bench.seeds)]
+
+
+def _agreement(bench: Workbench, *, run: Path | None = None, views: int = 8) -> dict[str, Any]:
     if run is None:
-        run = bench.train(bench.config(lambda config: config, seed=0))
+        run = bench.train(_ours(bench)[0])
     return agreement(
-        run, bench.data[0], bench.out, seeds=range(bench.seeds), views=views, limit=bench.limit,
-        progress=bench.progress,
+        run, bench.data[0], bench.out,
+        seeds=range(bench.seeds), views=views, limit=bench.limit, progress=bench.progress,
     )  # fmt: skip
 
 
-_TRAINING: dict[str, Callable[[Workbench], dict[str, Any]]] = {"health": health}
-_TRAINING |= {name: lambda bench, table=table: make(table, bench) for name, table in TABLES.items()}
-_TRAINING["critic"] = critic
-_TRAINING |= {"correlation": correlation, "predictions": predictions, "coverage": coverage}
-_TRAINING["front-vs-projection"] = front_vs_projection
+def _tables(tables: dict[str, Table]) -> dict[str, Experiment]:
+    return {
+        name: Experiment(lambda bench, table=table: make(table, bench), table.configs)
+        for name, table in tables.items()
+    }
 
-EXPERIMENTS = ("agreement", *_TRAINING)
-"""Names of all experiments."""
+
+EXPERIMENTS: dict[str, Experiment] = {
+    **_tables(TABLES),
+    "critic": Experiment(critic, TABLES["critic"].configs),
+    "correlation": Experiment(correlation, _ours),
+    "predictions": Experiment(predictions, _ours),
+    "coverage": Experiment(coverage.coverage, coverage.configs),
+    "runtime": Experiment(runtime, lambda bench: []),
+    "agreement": Experiment(_agreement, lambda bench: _ours(bench)[:1]),
+    "health": Experiment(health, lambda bench: []),
+    "front-vs-projection": Experiment(front_vs_projection, loss_trainings.configs),
+}
+"""All experiments, by the names of `train.questions.QUESTIONS`."""
 
 
 def run_experiment(name: str, bench: Workbench, *, run: Path | None = None, views: int = 8) -> dict[str, Any]:
@@ -55,11 +74,32 @@ def run_experiment(name: str, bench: Workbench, *, run: Path | None = None, view
     Raises:
         UserError: an unknown run, no usable data, or numbers out of range.
     """
-    if name == "agreement":
-        return _about_a_run(bench, run, views)
+    if name == "agreement" and (run is not None or views != 8):
+        return _agreement(bench, run=run, views=views)
     if run is not None:
         raise UserError(f"the experiment {name} trains what it needs; leave --run out")
-    result = _TRAINING[name](bench)
+    result = answer(name, EXPERIMENTS[name], bench)
     if bench.progress:
         print((bench.out / f"{name}.md").read_text())
     return result
+
+
+def show_all(bench: Workbench) -> None:
+    """Prints what there is, what of it is done, and how long the rest will take."""
+    lines = list(overview(_wanted(bench), bench))
+    print("\n".join(list_lines(lines, QUESTIONS, processes=bench.processes)))
+
+
+def run_all(bench: Workbench) -> None:
+    """Makes every experiment that is not done yet; see `answer_all`."""
+    made = answer_all(_wanted(bench), bench)
+    print(f"made: {', '.join(made)}" if made else "nothing to do: all experiments are done")
+
+
+def _wanted(bench: Workbench) -> dict[str, Experiment]:
+    """All experiments, in the order of their questions; that on photographs if there are any."""
+    return {
+        name: EXPERIMENTS[name]
+        for name in QUESTIONS
+        if name in EXPERIMENTS and (name != "photos" or bench.pictures)
+    }

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from train import figures
 from train.config import InferenceConfig
-from train.experiments.table import table_lines
+from train.experiments.table import table_lines, verdict
 from train.experiments.workbench import Workbench, as_it_is
 from train.scoring import Scores, stacked
 
@@ -42,6 +42,7 @@ def correlation(bench: Workbench) -> dict[str, Any]:
         is asked for.
     """
     config = bench.config(as_it_is, seed=0)
+    bench.train_all([bench.config(as_it_is, seed=seed) for seed in range(bench.seeds)])
     views = min(VIEWS, bench.split(config, "test").views)
     agreed, groups = [], []
     for seed in range(bench.seeds):
@@ -63,8 +64,26 @@ def correlation(bench: Workbench) -> dict[str, Any]:
         ),
         "within_shapes": _correlations(groups, within_shapes, least=0.0),
     }
+    result["claims"] = _claims(result)
     bench.publish("correlation", result, _markdown(result), _figure(result, agreed[0], groups[0]))
     return result
+
+
+def _claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The paper's figure in words: disagreement and error go together, over shapes and within them."""
+    words = {
+        "over_shapes": f"CD and disagreement, over shapes: rank correlation above {LEAST_OVER_SHAPES}",
+        "within_shapes": "CD and disagreement, over groups of codes of a shape: rank correlation above 0",
+    }
+    return [
+        {
+            "words": text,
+            "gain": result[question]["cd"]["spearman"]["mean"] - result[question]["cd"]["spearman"]["asked"],
+            "confidence": result[question]["cd"]["spearman"]["confidence"],
+            "verdict": verdict(result[question]["cd"]["spearman"]["confidence"]),
+        }
+        for question, text in words.items()
+    ]
 
 
 def pearson(a: Tensor, b: Tensor) -> Tensor:

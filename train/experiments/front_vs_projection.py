@@ -10,7 +10,6 @@ OUT/free-clouds/*.json, OUT/runs, OUT/scores    one fit or training each: a stud
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import sys
@@ -27,7 +26,7 @@ from train.errors import UserError
 from train.experiments import front_vs_projection_page as page
 from train.experiments import loss_trainings_page as networks_page
 from train.experiments.free_clouds import LOSSES, Fit, fit_cloud
-from train.experiments.loss_trainings import examples, study, trees_among
+from train.experiments.loss_trainings import examples, study
 from train.experiments.study_shapes import (
     EMBEDDED,
     Cameras,
@@ -73,11 +72,10 @@ def front_vs_projection(bench: Workbench) -> dict[str, Any]:
         iterations=bench.steps,
         progress=bench.progress,
     )
-    trees = trees_among(bench.data)
-    if not trees:
+    trained = bench.on_trees()
+    if not trained.data:
         print("no data tree among --data: the networks are left out", file=sys.stderr)
         return found
-    trained = dataclasses.replace(bench, data=trees)
     found["networks"] = study(trained)
     write_text(bench.out / "front-vs-projection.json", json.dumps(found, indent=1) + "\n")
     tables = page.markdown(found), networks_page.markdown(found["networks"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import statistics
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor
 from diffpoint import PinholeCamera, farthest_point_sample, nearest, visible_points
 from models import Predictor
 from train.batches import LoadedSplit
-from train.config import FitConfig, InferenceConfig, StageConfig, Supervision
+from train.config import FitConfig, InferenceConfig, StageConfig, Supervision, fit_config_from_json
 from train.experiments.workbench import Workbench
 from train.fit import STAGES
 from train.log import read_metrics
@@ -104,11 +103,6 @@ def configs(bench: Workbench) -> list[FitConfig]:
         for taught in TAUGHT.values()
         if single or taught.visibility == "zbuffer"
     ]
-
-
-def trees_among(data: Sequence[Path]) -> tuple[Path, ...]:
-    """Those of the sources that are data trees, on which a network can be trained."""
-    return tuple(root for root in data if (root / "data_list").is_dir())
 
 
 @torch.no_grad()
@@ -294,8 +288,10 @@ def _curve(bench: Workbench, config: FitConfig, stage: Literal[1, 2]) -> dict[st
         stage=0,
         split="val",
     )
-    records = [r for r in read_metrics(bench.train(config)) if r["stage"] == stage and "val_visible" in r]
-    before = sum(phase.steps for name, phase in config.phases.items() if STAGES[name] < stage)
+    run = bench.train(config, stage=stage)
+    records = [r for r in read_metrics(run) if r["stage"] == stage and "val_visible" in r]
+    trained = fit_config_from_json((run / "config.json").read_text(), where=str(run))
+    before = sum(phase.steps for name, phase in trained.phases.items() if STAGES[name] < stage)
     steps = [0, *(record["step"] - before for record in records)]
     curve = {
         name: [fresh[f"val_{name}"].item(), *(record[f"val_{name}"] for record in records)]

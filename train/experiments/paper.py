@@ -1,11 +1,19 @@
-"""The paper's tables, as far as they are asked of our own system."""
+"""The paper's tables: rows, the paper's figures beside them, and what they are meant to show."""
 
 from __future__ import annotations
 
 import dataclasses
 
-from train.config import FitConfig
-from train.experiments.table import Expectation, Row, Table
+import torch
+
+from models import Generator, Predictor
+from train.batches import LoadedSplit
+from train.config import FitConfig, System, with_variant
+from train.errors import UserError
+from train.experiments.table import Claim, Row, Table, below
+from train.experiments.workbench import Change, Workbench, as_it_is
+from train.recipes import with_system
+from train.scoring import Scores, diversity, novelty
 
 
 def deterministic(config: FitConfig) -> FitConfig:
@@ -33,6 +41,141 @@ def _both_stages(config: FitConfig, **changes: float) -> FitConfig:
     return dataclasses.replace(config, **stages)
 
 
+def with_beta(beta: float) -> Change:
+    """Another weight of the diversity loss in stage 1; the paper's is 10."""
+
+    def change(config: FitConfig) -> FitConfig:
+        return dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, beta=beta))
+
+    return change
+
+
+def of_system(system: System) -> Change:
+    """One of the methods that the paper compares itself with."""
+    return lambda config: with_system(config, system)
+
+
+def highly_diverse(config: FitConfig) -> FitConfig:
+    """The paper's model whose predictions disagree the more."""
+    return with_variant(config, "highly-diverse")
+
+
+def second_stage_without_diversity(config: FitConfig) -> FitConfig:
+    """Stage 1 as it is; stage 2 does not ask shapes to differ."""
+    return dataclasses.replace(config, stage2=dataclasses.replace(config.stage2, beta=0.0))
+
+
+def second_stage_alone(config: FitConfig) -> FitConfig:
+    """Joined views from the first step, from fresh weights; the guard on the image is of stage 1."""
+    return dataclasses.replace(
+        config, stage1=dataclasses.replace(config.stage1, steps=0), min_image_sensitivity=0.0
+    )
+
+
+_ANSWERS = 10
+_NEAREST_AMONG = 300
+
+
+def _spread_of_answers(row: Row, bench: Workbench, config: FitConfig) -> Scores:
+    """Diversity of ten answers to one image, and how far one of them is from the nearest training shape, which tells
+    shapes from noise; both mean chamfer distances x100."""
+    train = bench.split(config, "train")
+    some = torch.linspace(0, len(train) - 1, min(_NEAREST_AMONG, len(train))).long()
+
+    def measure(model: Predictor, test: LoadedSplit) -> Scores:
+        if not isinstance(model, Generator):
+            raise UserError(f"{row.name} takes no codes")
+        return {
+            "diversity": diversity(model, test, codes=_ANSWERS, seed=config.seed),
+            "novelty": novelty(model, test, train.points[some], seed=config.seed),
+        }
+
+    what = ["diversity", _ANSWERS, train.fingerprint, len(some)]
+    return bench.measured(config, what, measure, stage=row.stage)
+
+
+DIVERSITY = Table(
+    name="diversity",
+    title="How different are ten answers to one image?",
+    columns=("diversity", "novelty"),
+    rows=tuple(
+        Row(name=name, change=change, stage=1, measure=_spread_of_answers, paper={"diversity": theirs})
+        for name, change, theirs in (
+            ("whole clouds (EMD) + MoN", of_system("psgn-mon"), 1.65),
+            ("front constraint", without_diversity, 0.55),
+            ("front constraint + MoN", of_system("front-mon"), 2.52),
+            ("diversity loss, beta 1", with_beta(1.0), 2.88),
+            ("diversity loss, beta 5", with_beta(5.0), 3.18),
+            ("diversity loss, beta 10", as_it_is, 3.36),
+        )
+    ),
+    claims=(
+        below("diversity", "front constraint", "diversity loss, beta 10", times=3),
+        below("diversity", "front constraint", "whole clouds (EMD) + MoN"),
+        below("diversity", "whole clouds (EMD) + MoN", "front constraint + MoN"),
+        below("diversity", "front constraint + MoN", "diversity loss, beta 1"),
+        below("diversity", "diversity loss, beta 1", "diversity loss, beta 5"),
+        below("diversity", "diversity loss, beta 5", "diversity loss, beta 10"),
+    ),
+)
+
+_OURS = {"gt_to_pred": 1.39, "pred_to_gt": 1.98, "cd": 3.37, "fps_cd": 4.08, "fps_pred_to_gt": 2.35}
+_LIN = {"gt_to_pred": 1.66, "pred_to_gt": 2.35, "cd": 4.01, "fps_cd": 4.75, "fps_pred_to_gt": 2.59}
+_PSGN = {"gt_to_pred": 2.06, "pred_to_gt": 2.27, "cd": 4.34, "fps_cd": 4.34, "fps_pred_to_gt": 2.27}
+_PTN = {"gt_to_pred": 1.86, "pred_to_gt": 2.60, "cd": 4.46}
+_R2N2 = {"gt_to_pred": 2.47, "pred_to_gt": 3.21, "cd": 5.68}
+
+SINGLE_CATEGORY = Table(
+    name="single-category",
+    title="Which method reconstructs shapes of one category best from eight views?",
+    of_one_category=True,
+    columns=("gt_to_pred", "pred_to_gt", "cd", "fps_cd", "fps_pred_to_gt", "best_cd"),
+    rows=(
+        Row(name="3D-R2N2", change=of_system("r2n2"), views=5, paper=_R2N2),
+        Row(name="PTN", change=of_system("ptn"), paper=_PTN),
+        Row(name="PSGN", change=of_system("psgn"), paper=_PSGN),
+        Row(name="PSGN, views joined", change=of_system("psgn"), scored="joined"),
+        Row(name="Lin et al.", change=of_system("lin"), paper=_LIN),
+        Row(name="ours", paper=_OURS),
+        Row(name="ours, random codes", codes="random"),
+        Row(name="nearest training shape by image", answer="nearest image"),
+        Row(name="medoid of the training shapes", answer="medoid"),
+    ),
+    claims=(
+        below("cd", "ours", "Lin et al."),
+        below("cd", "Lin et al.", "PSGN"),
+        below("cd", "PSGN", "PTN"),
+        below("cd", "PTN", "3D-R2N2"),
+        below("cd", "ours", "PSGN"),
+        below("fps_cd", "ours", "PSGN"),
+        below("fps_cd", "ours", "Lin et al."),
+        below("fps_pred_to_gt", "PSGN", "ours"),
+    ),
+)
+
+MULTI_CATEGORY = Table(
+    name="multi-category",
+    title="One network for all categories: which method is best from eight views?",
+    columns=("gt_to_pred", "pred_to_gt", "cd", "fps_cd"),
+    rows=(
+        # The paper's 5.68 is a mean of categories, its other figures are means of shapes.
+        Row(name="3D-R2N2", change=of_system("r2n2"), views=5, paper={"cd": 5.51}),
+        Row(name="PSGN", change=of_system("psgn"), paper={"cd": 4.39, "fps_cd": 4.39}),
+        Row(name="ours", paper={"cd": 3.58, "fps_cd": 4.34}),
+    ),
+    claims=(
+        below("cd", "ours", "PSGN"),
+        below("cd", "ours", "3D-R2N2"),
+        below("cd", "PSGN", "3D-R2N2"),
+        below("fps_cd", "ours", "PSGN"),
+    ),
+    category_claims=(
+        below("cd", "ours", "PSGN"),
+        below("cd", "ours", "3D-R2N2"),
+        below("fps_cd", "ours", "PSGN"),
+    ),
+)
+
 DETERMINISTIC = Table(
     name="deterministic",
     title="Does a random code pay, where only a fixed answer is wanted?",
@@ -44,11 +187,11 @@ DETERMINISTIC = Table(
         Row(name="nearest training shape by image", answer="nearest image"),
         Row(name="medoid of the training shapes", answer="medoid"),
     ),
-    expectations=(
-        Expectation("cd", "conditional", "deterministic"),
-        Expectation("fps_cd", "conditional", "deterministic"),
-        Expectation("cd", "conditional, without the diversity loss", "deterministic"),
-        Expectation("fps_cd", "conditional, without the diversity loss", "deterministic"),
+    claims=(
+        below("cd", "conditional", "deterministic"),
+        below("fps_cd", "conditional", "deterministic"),
+        below("cd", "conditional, without the diversity loss", "deterministic"),
+        below("fps_cd", "conditional, without the diversity loss", "deterministic"),
     ),
 )
 
@@ -61,47 +204,129 @@ CRITIC = Table(
         Row(name="without, after stage 1", change=without_critic, stage=1),
         Row(name="with, after stage 1", change=with_critic, stage=1),
     ),
-    expectations=(
-        Expectation("cd", "with (gamma 0.1)", "without"),
-        Expectation("fps_cd", "with (gamma 0.1)", "without"),
+    claims=(
+        below("cd", "with (gamma 0.1)", "without"),
+        below("fps_cd", "with (gamma 0.1)", "without"),
     ),
 )
 
-STAGES = Table(
-    name="stages",
-    title="What do stage 2 and agreement on the codes add?",
+_S1, _S1_AGREED = "stage 1, random codes", "stage 1, agreed codes"
+_PLAIN, _ALONE = "both, stage 2 without diversity, random codes", "stage 2 alone, agreed codes"
+_BOTH, _SEARCHED, _AGREED = (
+    "both stages, " + codes for codes in ("random codes", "searched codes", "agreed codes")
+)
+
+ABLATION = Table(
+    name="ablation",
+    title="What do the stages, the diversity loss in stage 2 and agreement on the codes add?",
     rows=(
-        Row(name="stage 1, random codes", stage=1, codes="random", paper={"cd": 3.97, "fps_cd": 6.30}),
-        Row(name="stage 1, agreed codes", stage=1, paper={"cd": 3.87, "fps_cd": 5.77}),
-        Row(name="stages 1 and 2, random codes", codes="random", paper={"cd": 3.40, "fps_cd": 4.16}),
-        Row(name="stages 1 and 2, searched codes", codes="searched"),
-        Row(name="stages 1 and 2, agreed codes", paper={"cd": 3.37, "fps_cd": 4.08}),
+        Row(name=_S1, stage=1, codes="random", paper={"cd": 3.97, "fps_cd": 6.30}),
+        Row(name=_S1_AGREED, stage=1, paper={"cd": 3.87, "fps_cd": 5.77}),
+        Row(
+            name=_PLAIN,
+            change=second_stage_without_diversity,
+            codes="random",
+            paper={"cd": 3.51, "fps_cd": 4.18},
+        ),
+        Row(name=_BOTH, codes="random", paper={"cd": 3.40, "fps_cd": 4.16}),
+        Row(name=_SEARCHED, codes="searched"),
+        Row(name=_ALONE, change=second_stage_alone, paper={"cd": 3.52, "fps_cd": 4.24}),
+        Row(name=_AGREED, paper={"cd": 3.37, "fps_cd": 4.08}),
     ),
-    expectations=(
-        Expectation("cd", "stages 1 and 2, random codes", "stage 1, random codes"),
-        Expectation("fps_cd", "stages 1 and 2, random codes", "stage 1, random codes"),
-        Expectation("fps_cd", "stages 1 and 2, agreed codes", "stage 1, agreed codes"),
-        Expectation("cd", "stage 1, agreed codes", "stage 1, random codes"),
-        Expectation("fps_cd", "stage 1, agreed codes", "stage 1, random codes"),
-        Expectation("cd", "stages 1 and 2, agreed codes", "stages 1 and 2, random codes"),
-        Expectation("fps_cd", "stages 1 and 2, agreed codes", "stages 1 and 2, random codes"),
+    claims=(
+        Claim(
+            "FPS-CD: stage 2 gains more than agreement after stage 1",
+            lambda r: (
+                r[_S1_AGREED]["fps_cd"] - r[_AGREED]["fps_cd"] - (r[_S1]["fps_cd"] - r[_S1_AGREED]["fps_cd"])
+            ),
+        ),
+        below("fps_cd", _AGREED, _S1_AGREED),
+        below("cd", _BOTH, _S1),
+        below("cd", _BOTH, _PLAIN),
+        below("fps_cd", _BOTH, _PLAIN),
+        below("cd", _AGREED, _ALONE),
+        below("fps_cd", _AGREED, _ALONE),
+        below("cd", _S1_AGREED, _S1),
+        below("fps_cd", _S1_AGREED, _S1),
+        below("cd", _AGREED, _BOTH),
+        below("fps_cd", _AGREED, _BOTH),
+        Claim(
+            "FPS-CD: agreement helps more after stage 1 than after both",
+            lambda r: (
+                r[_S1]["fps_cd"] - r[_S1_AGREED]["fps_cd"] - (r[_BOTH]["fps_cd"] - r[_AGREED]["fps_cd"])
+            ),
+        ),
     ),
 )
+
+CONSISTENCY = Table(
+    name="consistency",
+    title="What do search and descent do for the highly diverse model?",
+    columns=("gt_to_pred", "pred_to_gt", "cd", "fps_cd", "consistency"),
+    rows=(
+        Row(
+            name="random codes", change=highly_diverse, codes="random",
+            paper={"gt_to_pred": 1.40, "pred_to_gt": 7.76, "cd": 9.15, "consistency": 13.96},
+        ),
+        Row(
+            name="searched", change=highly_diverse, codes="searched",
+            paper={"gt_to_pred": 1.41, "pred_to_gt": 3.24, "cd": 4.65, "consistency": 5.96},
+        ),
+        Row(
+            name="searched and descended", change=highly_diverse, codes="agreed as in the paper",
+            paper={"gt_to_pred": 1.40, "pred_to_gt": 2.80, "cd": 4.21, "consistency": 4.66},
+        ),
+        Row(name="searched and descended, the profile's steps", change=highly_diverse),
+        Row(name="the main model, random codes", codes="random"),
+    ),
+    claims=(
+        below("consistency", "searched", "random codes"),
+        below("consistency", "searched and descended", "searched"),
+        below("cd", "searched", "random codes"),
+        below("cd", "searched and descended", "searched"),
+        Claim(
+            "the gain is in pred->GT: ten times the change of GT->pred",
+            lambda r: (
+                r["random codes"]["pred_to_gt"] - r["searched and descended"]["pred_to_gt"]
+                - 10 * abs(r["searched and descended"]["gt_to_pred"] - r["random codes"]["gt_to_pred"])
+            ),
+        ),
+        below("consistency", "the main model, random codes", "random codes", times=3),
+    ),
+)  # fmt: skip
 
 _PAPER_VIEWS = {
     1: (5.37, 5.37), 2: (4.57, 4.69), 3: (4.08, 4.33), 4: (3.79, 4.18),
     5: (3.69, 4.18), 6: (3.54, 4.13), 7: (3.44, 4.12), 8: (3.37, 4.08),
 }  # fmt: skip
+_OF_VIEWS = {n: f"{n} view{'s' if n > 1 else ''}" for n in _PAPER_VIEWS}
 VIEWS = Table(
     name="views",
     title="How much does each further image add?",
     rows=tuple(
-        Row(name=f"{n} view{'s' if n > 1 else ''}", views=n, paper={"cd": cd, "fps_cd": fps})
+        Row(name=_OF_VIEWS[n], views=n, paper={"cd": cd, "fps_cd": fps})
         for n, (cd, fps) in _PAPER_VIEWS.items()
     ),
-    expectations=tuple(
-        Expectation("cd", f"{n + 1} views", f"{n} view{'s' if n > 1 else ''}") for n in range(1, 8)
+    claims=(
+        *(below("cd", _OF_VIEWS[n + 1], _OF_VIEWS[n]) for n in range(1, 8)),
+        Claim(
+            "CD falls most from 1 view to 2",
+            lambda r: r["1 view"]["cd"] - r["2 views"]["cd"] - (r["2 views"]["cd"] - r["3 views"]["cd"]),
+        ),
+        Claim(
+            "FPS-CD falls more from 1 view to 2 than from 4 to 8",
+            lambda r: (
+                r["1 view"]["fps_cd"]
+                - r["2 views"]["fps_cd"]
+                - (r["4 views"]["fps_cd"] - r["8 views"]["fps_cd"])
+            ),
+        ),
     ),
 )
 
-TABLES = {table.name: table for table in (DETERMINISTIC, CRITIC, STAGES, VIEWS)}
+TABLES = {
+    table.name: table
+    for table in (
+        DIVERSITY, SINGLE_CATEGORY, MULTI_CATEGORY, DETERMINISTIC, ABLATION, CONSISTENCY, VIEWS, CRITIC
+    )
+}  # fmt: skip

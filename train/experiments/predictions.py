@@ -15,7 +15,7 @@ from train import figures
 from train.batches import LoadedSplit
 from train.data import ShapeTree
 from train.errors import UserError
-from train.experiments.table import confidence, table_lines
+from train.experiments.table import judged, table_lines
 from train.experiments.workbench import Workbench, as_it_is
 from train.report import make_example, pick_shapes
 from train.scoring import SHAPES_AT_ONCE, Scores, stacked, view_order
@@ -36,6 +36,7 @@ def predictions(bench: Workbench) -> dict[str, Any]:
         of bootstrap samples, over trainings and shapes, in which the back varies more than 1.5 times as much.
     """
     configs = [bench.config(as_it_is, seed=seed) for seed in range(bench.seeds)]
+    bench.train_all(configs)
     test = bench.split(configs[0], "test")
     by_seed = []
     for config in configs:
@@ -52,8 +53,12 @@ def predictions(bench: Workbench) -> dict[str, Any]:
             name: _summary({k: v[:, [c == name for c in test.categories]] for k, v in scores.items()})
             for name in names
         },
-        "asked": LEAST_RATIO,
-        "confidence": confidence(scores["back"] - LEAST_RATIO * scores["front"]),
+        "claims": [
+            judged(
+                f"the back varies more than {LEAST_RATIO} times as much as the front",
+                scores["back"] - LEAST_RATIO * scores["front"],
+            )
+        ],
     }
     bench.publish("predictions", result, _markdown(result), _figure(bench))
     return result
@@ -126,8 +131,8 @@ def _markdown(result: Mapping[str, Any]) -> str:
         f"{result['codes']} codes for one image of each of {result['shapes']} held-out shapes, profile "
         f"`{result['profile']}`, {trainings}. Spread x100: mean distance of a point from its mean place over the "
         "codes, for the points that the image's camera sees and for those behind; surface: from the nearest point of "
-        f"another prediction. The back varies more than {result['asked']} times as much as the front in "
-        f"{result['confidence']:.1%} of the bootstrap samples over trainings and shapes."
+        f"another prediction. The back varies more than {LEAST_RATIO} times as much as the front in "
+        f"{result['claims'][0]['confidence']:.1%} of the bootstrap samples over trainings and shapes."
     )
     rows = [
         [

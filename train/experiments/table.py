@@ -1,15 +1,14 @@
-"""A table of the paper as a declaration: which systems, scored how, and which of them should be better.
+"""A table of the paper as a declaration: which systems, measured how, and what they are expected to show.
 
-`make` trains what is missing, scores it, and writes NAME.json, NAME.md and NAME.png. Every expectation ("a below b")
-gets a paired bootstrap over shapes and seeds and a verdict in words.
+`make` trains what is missing, measures it, and writes NAME.json, NAME.md and NAME.png. Every claim ("a below b") gets a
+paired bootstrap over shapes and trainings and a verdict in words.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -19,64 +18,102 @@ from torch import Tensor
 
 from train import figures
 from train.config import FitConfig, InferenceConfig
-from train.experiments.workbench import Change, Workbench, as_it_is
+from train.experiments.workbench import Change, Workbench, as_it_is, stage1_of
 from train.files import write_text
-from train.scoring import Scores
+from train.scoring import Scores, stacked
 
 NAMES = {
     "gt_to_pred": "GT->pred",
     "pred_to_gt": "pred->GT",
     "cd": "CD",
     "fps_cd": "FPS-CD",
+    "fps_pred_to_gt": "FPS pred->GT",
+    "best_cd": "best view's CD",
     "emd": "EMD",
     "consistency": "consistency",
+    "diversity": "diversity",
+    "novelty": "to the nearest training shape",
 }
 _RESAMPLES = 4000
 _SURE = 0.9
 
+Measure = Callable[["Row", Workbench, FitConfig], Scores]
+"""(row, bench, its configuration with a seed) -> figure -> (M,) of every held-out shape."""
+
+
+def reconstructions(row: Row, bench: Workbench, config: FitConfig) -> Scores:
+    """What a row's system makes of several images of each shape, beside the truth."""
+    if row.answer != "network":
+        return bench.trivial_scores(row.answer, config, views=row.views)
+    settings = config.inference
+    if row.codes == "searched":
+        settings = dataclasses.replace(settings, steps=0)
+    elif row.codes == "random":
+        settings = InferenceConfig(groups=1, steps=0)
+    elif row.codes == "agreed as in the paper":
+        settings = InferenceConfig()
+    if row.scored is not None:
+        settings = dataclasses.replace(settings, scored=row.scored)
+    return bench.scores(config, settings, stage=row.stage, views=row.views)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Row:
-    """A system, or an answer without one, and how it is scored.
+    """A system, or an answer without one, and how it is measured.
 
     Attributes:
         name: as the table shows it.
         change: how its training differs from the profile's.
-        stage: whose best weights are scored.
-        codes: "agreed" on by search and descent as the profile does it, "searched" only, or "random".
+        stage: whose best weights are measured.
+        codes: "agreed" on by search and descent as the profile does it, or as the paper does it; "searched" only; or
+            "random".
         views: how many.
+        scored: see `InferenceConfig`; the system's own way if None.
         answer: "network", or what is answered instead.
+        measure: takes the figures.
         paper: the paper's figures.
     """
 
     name: str
     change: Change = as_it_is
     stage: Literal[1, 2] = 2
-    codes: Literal["agreed", "searched", "random"] = "agreed"
+    codes: Literal["agreed", "agreed as in the paper", "searched", "random"] = "agreed"
     views: int = 8
+    scored: Literal["joined", "each"] | None = None
     answer: Literal["network", "medoid", "nearest image"] = "network"
+    measure: Measure = reconstructions
     paper: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
-    def scores(self, bench: Workbench, *, seed: int) -> Scores:
-        """Figure -> (M,)."""
-        config = bench.config(self.change, seed=seed)
-        if self.answer != "network":
-            return bench.trivial_scores(self.answer, config, views=self.views)
-        settings = config.inference
-        if self.codes == "searched":
-            settings = dataclasses.replace(settings, steps=0)
-        if self.codes == "random":
-            settings = InferenceConfig(groups=1, steps=0)
-        return bench.scores(config, settings, stage=self.stage, views=self.views)
+
+Rows = Mapping[str, Mapping[str, Any]]
+"""Row -> figure -> its values (S, M); of the paper, a number."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Expectation:
-    """The paper says: this figure is lower in one row than in another."""
+class Claim:
+    """What the paper's table shows.
 
-    figure: str
-    lower: str
-    higher: str
+    Attributes:
+        words: what is claimed.
+        gain: of the rows' values; above 0 where the claim holds.
+    """
+
+    words: str
+    gain: Callable[[Rows], Any]
+
+
+def below(figure: str, lower: str, higher: str, *, times: float = 1.0) -> Claim:
+    """The claim that a figure is lower in one row than in another, by a factor if one is given.
+
+    Example:
+        >>> below("cd", "a", "b").gain({"a": {"cd": 3.0}, "b": {"cd": 4.0}})
+        1.0
+    """
+    least = "" if times == 1 else f"{times:g} x "
+    return Claim(
+        f"{NAMES[figure]}: {least}{lower} < {higher}",
+        lambda rows: rows[higher][figure] - times * rows[lower][figure],
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,56 +124,85 @@ class Table:
         name: of its files.
         title: what it asks, in a line.
         rows: from top to bottom.
-        expectations: what the paper's table shows.
-        columns: figures of `train.scoring.FIGURES`.
+        claims: what the paper's table shows.
+        category_claims: what it shows in every category; with any, the table has a line for each category.
+        columns: figures of `NAMES`.
+        of_one_category: train and score on the bench's category alone.
     """
 
     name: str
     title: str
     rows: tuple[Row, ...]
-    expectations: tuple[Expectation, ...] = ()
+    claims: tuple[Claim, ...] = ()
+    category_claims: tuple[Claim, ...] = ()
     columns: tuple[str, ...] = ("gt_to_pred", "pred_to_gt", "cd", "fps_cd")
+    of_one_category: bool = False
+
+    def config(self, row: Row, bench: Workbench, *, seed: int) -> FitConfig:
+        """How a row's system is trained."""
+        config = bench.config(row.change, seed=seed)
+        return dataclasses.replace(config, categories=(bench.category,)) if self.of_one_category else config
 
     def configs(self, bench: Workbench) -> list[FitConfig]:
-        """Every training that the table needs, each once, seed by seed."""
-        found: dict[Path, FitConfig] = {}
-        for seed in range(bench.seeds):
-            for row in self.rows:
-                config = bench.config(row.change, seed=seed)
-                found.setdefault(bench.run_of(config), config)
-        return list(found.values())
+        """Every training that the table rests on, no longer than it needs it, seed by seed."""
+        return [self._training(row, bench, seed) for seed in range(bench.seeds) for row in self._networks()]
+
+    def missing(self, bench: Workbench) -> list[FitConfig]:
+        """Those of `configs` whose scores are not kept."""
+
+        def needed(row: Row, seed: int) -> bool:
+            config = self.config(row, bench, seed=seed)
+            return bench.needs_training(lambda asked: row.measure(row, asked, config))
+
+        return [
+            self._training(row, bench, seed)
+            for seed in range(bench.seeds)
+            for row in self._networks()
+            if needed(row, seed)
+        ]
+
+    def _networks(self) -> list[Row]:
+        return [row for row in self.rows if row.answer == "network"]
+
+    def _training(self, row: Row, bench: Workbench, seed: int) -> FitConfig:
+        config = self.config(row, bench, seed=seed)
+        return stage1_of(config) if row.stage == 1 else config
 
 
 def make(table: Table, bench: Workbench) -> dict[str, Any]:
-    """Trains and scores what is missing, and writes the table into `bench.out`.
+    """Trains and measures what is missing, and writes the table into `bench.out`.
 
     Returns:
         What NAME.json holds.
     """
-    bench.train_all(table.configs(bench))
-    scores = {
-        row.name: _stacked([row.scores(bench, seed=seed) for seed in range(bench.seeds)])
-        for row in table.rows
-    }
-    config = bench.config(table.rows[0].change, seed=0)
+    bench.train_all(table.missing(bench))
+
+    def measured(row: Row) -> Scores:
+        configs = [table.config(row, bench, seed=seed) for seed in range(bench.seeds)]
+        return stacked([row.measure(row, bench, config) for config in configs])
+
+    scores = {row.name: measured(row) for row in table.rows}
+    config = table.config(table.rows[0], bench, seed=0)
+    paper = {row.name: row.paper for row in table.rows}
+    kinds = bench.split(config, "test").categories
     result: dict[str, Any] = {
         "title": table.title,
         "profile": bench.profile,
         "data": [str(root) for root in bench.data],
-        "shapes": next(iter(scores.values()))["cd"].shape[1],
+        "category": bench.category if table.of_one_category else None,
+        "shapes": len(kinds),
         "seeds": bench.seeds,
+        "columns": list(table.columns),
         "config": dataclasses.asdict(config),
         "rows": {row.name: _figures(row, scores[row.name], table.columns) for row in table.rows},
-        "expectations": [_verdict(e, scores, table.rows) for e in table.expectations],
+        "claims": [_verdict(claim, scores, paper) for claim in table.claims],
     }
+    if table.category_claims:
+        result["categories"] = _categories(table, scores, kinds)
     write_text(bench.out / f"{table.name}.json", json.dumps(result, indent=2) + "\n")
-    write_text(bench.out / f"{table.name}.md", markdown(result, table.columns))
-    figures.save(_figure(result, table.columns), bench.out / f"{table.name}.png")
+    write_text(bench.out / f"{table.name}.md", markdown(result))
+    figures.save(_figure(result), bench.out / f"{table.name}.png")
     return result
-
-
-def _stacked(by_seed: Sequence[Scores]) -> Scores:
-    return {name: torch.stack([scores[name] for scores in by_seed]) for name in by_seed[0]}
 
 
 def _figures(row: Row, scores: Scores, columns: Sequence[str]) -> dict[str, Any]:
@@ -148,7 +214,7 @@ def _figures(row: Row, scores: Scores, columns: Sequence[str]) -> dict[str, Any]
         "paper": dict(row.paper),
     }
     found["sd"] = {name: values.std().item() if len(values) > 1 else None for name, values in by_seed.items()}
-    if "searched" in scores and row.codes == "agreed":
+    if "searched" in scores and row.codes.startswith("agreed"):
         lowered = scores["consistency"] < scores["searched"]
         found["consistency"] = {
             "searched": scores["searched"].mean().item(),
@@ -158,21 +224,46 @@ def _figures(row: Row, scores: Scores, columns: Sequence[str]) -> dict[str, Any]
     return found
 
 
-def _verdict(expected: Expectation, scores: Mapping[str, Scores], rows: Sequence[Row]) -> dict[str, Any]:
-    gain = scores[expected.higher][expected.figure] - scores[expected.lower][expected.figure]
+def _categories(table: Table, scores: Mapping[str, Scores], kinds: Sequence[str]) -> dict[str, Any]:
+    """Each category's figures and verdicts, and the averages of shapes and of categories."""
+    found: dict[str, Any] = {}
+    for kind in dict.fromkeys(kinds):
+        mine = torch.tensor([k == kind for k in kinds])
+        part = {row: {name: values[:, mine] for name, values in s.items()} for row, s in scores.items()}
+        found[kind] = {
+            "shapes": int(mine.sum()),
+            "rows": {
+                row: {c: s[c].mean().item() for c in table.columns if c in s} for row, s in part.items()
+            },
+            "claims": [_verdict(claim, part, {}) for claim in table.category_claims],
+        }
+    return found
+
+
+def _verdict(claim: Claim, rows: Mapping[str, Scores], paper: Rows) -> dict[str, Any]:
+    try:
+        theirs = claim.gain(paper)
+    except KeyError:  # the paper has no figure for one of the rows
+        theirs = None
+    return judged(claim.words, claim.gain(rows), paper_gain=theirs)
+
+
+def judged(words: str, gain: Tensor, *, paper_gain: float | None = None) -> dict[str, Any]:
+    """What became of the claim that a gain (S, M), over trainings and shapes, is above 0."""
     sure = confidence(gain)
-    paper = {row.name: row.paper for row in rows}
-    theirs = None
-    if expected.figure in paper[expected.higher] and expected.figure in paper[expected.lower]:
-        theirs = paper[expected.higher][expected.figure] - paper[expected.lower][expected.figure]
     return {
-        **dataclasses.asdict(expected),
+        "words": words,
         "gain": gain.mean().item(),
         "gain_by_seed": gain.mean(1).tolist(),
-        "paper_gain": theirs,
+        "paper_gain": paper_gain,
         "confidence": sure,
-        "verdict": "holds" if sure >= _SURE else "does not hold" if sure <= 1 - _SURE else "undecided",
+        "verdict": verdict(sure),
     }
+
+
+def verdict(sure: float) -> Literal["holds", "undecided", "does not hold"]:
+    """In words, what a share of bootstrap samples (`confidence`) says of a claim."""
+    return "holds" if sure >= _SURE else "does not hold" if sure <= 1 - _SURE else "undecided"
 
 
 def confidence(gain: Tensor, *, seed: int = 0) -> float:
@@ -185,40 +276,93 @@ def confidence(gain: Tensor, *, seed: int = 0) -> float:
     return float((sums > 0).mean())
 
 
-def markdown(result: Mapping[str, Any], columns: Sequence[str]) -> str:
-    """The table, and what became of each expectation."""
-    seeds = result["seeds"]
-    plural = "trainings" if seeds > 1 else "training"
-    head = (
-        f"{result['title']} {result['shapes']} held-out shapes, profile `{result['profile']}`, {seeds} {plural} of "
-        "each; un-squared distances x100, mean ± standard deviation over trainings. In brackets: the paper."
-    )
-    lines = [
-        head,
-        "",
-        table_row(["", *(NAMES[c] for c in columns)]),
-        table_row(["---", *["---:"] * len(columns)]),
-    ]
-    for name, row in result["rows"].items():
-        lines.append(table_row([name, *(_cell(row, column) for column in columns)]))
-    if result["expectations"]:
-        lines += ["", table_row(["expected", "gain", "paper's", "confidence", ""])]
-        lines.append(table_row(["---", "---:", "---:", "---:", "---"]))
-    for e in result["expectations"]:
-        claim = f"{NAMES[e['figure']]}: {e['lower']} < {e['higher']}"
-        paper = "" if e["paper_gain"] is None else f"{e['paper_gain']:+.2f}"
-        lines.append(table_row([claim, f"{e['gain']:+.2f}", paper, f"{e['confidence']:.1%}", e["verdict"]]))
+def markdown(result: Mapping[str, Any]) -> str:
+    """The table, and what became of each claim."""
+    columns = result["columns"]
+    lines = [_head(result), ""]
+    rows = [[name, *(_cell(row, column) for column in columns)] for name, row in result["rows"].items()]
+    lines += table_lines(["", *(NAMES[c] for c in columns)], rows)
+    if "categories" in result:
+        lines += ["", *_category_lines(result)]
+    if result["claims"]:
+        lines += ["", *claim_lines(result["claims"])]
     agreed = {name: row["consistency"] for name, row in result["rows"].items() if "consistency" in row}
     if agreed:
         lines += [
             "",
             "Consistency loss before and after the descent, and the share of shapes that it lowered:",
+            "",
         ]
         lines += [
             f"- {name}: {found['searched']:.2f}, {found['descended']:.2f}, {found['lowered_share']:.1%}"
             for name, found in agreed.items()
         ]
     return "\n".join([*lines, ""])
+
+
+def _head(result: Mapping[str, Any]) -> str:
+    of = f" of the category {result['category']}" if result["category"] else ""
+    return (
+        f"{result['title']} {result['shapes']} held-out shapes{of}, profile `{result['profile']}`, "
+        f"{trainings(result['seeds'])} of each; un-squared distances x100, mean ± standard deviation over trainings. "
+        "In brackets: the paper."
+    )
+
+
+def trainings(count: int) -> str:
+    """So many trainings, in words.
+
+    Example:
+        >>> trainings(1)
+        '1 training'
+    """
+    return f"{count} training{'s' if count > 1 else ''}"
+
+
+def claim_lines(claims: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A Markdown table of verdicts."""
+    lines = [table_row(["claim", "gain", "paper's", "confidence", ""]), "| --- | ---: | ---: | ---: | --- |"]
+    for claim in claims:
+        paper = "" if claim["paper_gain"] is None else f"{claim['paper_gain']:+.2f}"
+        lines.append(
+            table_row(
+                [
+                    claim["words"],
+                    f"{claim['gain']:+.2f}",
+                    paper,
+                    f"{claim['confidence']:.1%}",
+                    claim["verdict"],
+                ]
+            )
+        )
+    return lines
+
+
+def _category_lines(result: Mapping[str, Any]) -> list[str]:
+    """CD and FPS-CD of every category and row; the averages of shapes and of categories below."""
+    names, found = list(result["rows"]), result["categories"]
+
+    def cells(rows: Mapping[str, Mapping[str, float]]) -> list[str]:
+        return [f"{rows[name]['cd']:.2f} ({rows[name]['fps_cd']:.2f})" for name in names]
+
+    lines = [
+        [kind, str(each["shapes"]), *cells(each["rows"]), ", ".join(c["verdict"] for c in each["claims"])]
+        for kind, each in found.items()
+    ]
+    every = [each["rows"] for each in found.values()]
+    of_shapes = {name: row["mean"] for name, row in result["rows"].items()}
+    of_categories = {
+        name: {c: float(np.mean([rows[name][c] for rows in every])) for c in ("cd", "fps_cd")}
+        for name in names
+    }
+    lines.append(["mean of shapes", str(result["shapes"]), *cells(of_shapes), ""])
+    lines.append(["mean of categories", "", *cells(of_categories), ""])
+    words = "; ".join(claim["words"] for claim in next(iter(found.values()))["claims"])
+    return [
+        f"CD (FPS-CD) by category, and whether it holds there that {words}:",
+        "",
+        *table_lines(["", "shapes", *names, "verdicts"], lines),
+    ]
 
 
 def _cell(row: Mapping[str, Any], column: str) -> str:
@@ -240,9 +384,9 @@ def table_lines(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]
     return [table_row(cells) for cells in (head, ruler, *rows)]
 
 
-def _figure(result: Mapping[str, Any], columns: Sequence[str]) -> Figure:
+def _figure(result: Mapping[str, Any]) -> Figure:
     """A panel for each column: a dot for each training, a bar for their mean."""
-    rows = list(result["rows"])
+    rows, columns = list(result["rows"]), result["columns"]
     figure = Figure(figsize=(3.2 * len(columns) + 2, 0.42 * len(rows) + 1.4), layout="constrained", dpi=110)
     panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
     for axes, column in zip(panels, columns, strict=True):
@@ -257,6 +401,6 @@ def _figure(result: Mapping[str, Any], columns: Sequence[str]) -> Figure:
         axes.grid(alpha=0.25, axis="x")
     panels[0].set_yticks(range(len(rows)), rows)
     panels[0].invert_yaxis()
-    trainings = f"{result['seeds']} training{'s' if result['seeds'] > 1 else ''} of each"
-    figure.suptitle(f"{result['title']} {result['shapes']} shapes, {trainings}", fontsize=11)
+    of = f"{result['shapes']} shapes, {trainings(result['seeds'])} of each"
+    figure.suptitle(f"{result['title']} {of}", fontsize=11)
     return figure

@@ -1,9 +1,11 @@
 """What experiments share: runs that are trained once and scores that are taken once, whoever asks for them.
 
-    OUT/runs/KEY-seed0/           a run of `fit`; KEY is of its configuration and its data. `trained.json`: it is done
+    OUT/runs/KEY-seed0/           a run of `fit`; KEY is of its configuration and its data. `trained.json`: it is done.
+                                  Stage 1 and stage 2 are runs of their own, so that trainings share a stage 1
     OUT/scores/KEY.safetensors    one network on one split, with one choice of views and codes
 
 An experiment that is stopped goes on where it was when it is called again: `fit` resumes, finished scores are read.
+Scores outlive their runs: where they are kept, a table is made again, or finished on another machine, without training.
 """
 
 from __future__ import annotations
@@ -45,6 +47,11 @@ _NO_PART_OF_A_KEY = (
     "keep_checkpoints",
 )
 
+
+class Untrained(Exception):
+    """A run that is not there, where nothing may be trained."""
+
+
 Change = Callable[[FitConfig], FitConfig]
 """How a variant's configuration differs from its profile's."""
 
@@ -62,6 +69,9 @@ class Workbench:
         steps: if given, the same number of steps for every phase, for a quick look.
         progress: show bars.
         processes: how many trainings at once, each in a process with one thread.
+        category: what experiments on shapes of one kind are about.
+        pictures: a folder of photographs for each object, for the experiment that shows what is made of them.
+        trains: False: what would have to be trained is refused with `Untrained`.
     """
 
     data: tuple[Path, ...]
@@ -72,7 +82,10 @@ class Workbench:
     steps: int | None = None
     progress: bool = True
     processes: int = 1
-    _loaded: dict[tuple, LoadedSplit] = dataclasses.field(default_factory=dict, init=False, repr=False)
+    category: str = "chair"
+    pictures: Path | None = None
+    trains: bool = True
+    _loaded: dict[tuple, LoadedSplit] = dataclasses.field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -82,6 +95,12 @@ class Workbench:
         if self.processes < 1:
             raise UserError(f"--processes must be at least 1; got {self.processes}")
 
+    def on_trees(self) -> Workbench:
+        """With the data trees among its data alone, on which networks can be trained."""
+        return dataclasses.replace(
+            self, data=tuple(root for root in self.data if (root / "data_list").is_dir())
+        )
+
     def config(self, change: Change, *, seed: int) -> FitConfig:
         """The profile's configuration with a variant's changes."""
         config = dataclasses.replace(change(PROFILES[self.profile]), seed=seed)
@@ -89,34 +108,69 @@ class Workbench:
 
     def run_of(self, config: FitConfig) -> Path:
         """Where a configuration's run is kept."""
-        values = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NO_PART_OF_A_KEY}
-        trees = [_tree_fingerprint(root) for root in self.data]
-        key = _digest(json.dumps([values, trees], sort_keys=True))
+        values = {k: v for k, v in _own_values(config).items() if k not in _NO_PART_OF_A_KEY}
+        key = _digest(json.dumps([values, self.fingerprints()], sort_keys=True))
         return self.out / "runs" / f"{key}-seed{config.seed}"
+
+    def fingerprints(self) -> list[str]:
+        """Of each data tree: changes when its lists, or what it was made with, change."""
+        if not self.data:
+            raise UserError("no data; name one or more data trees with --data")
+        return [_tree_fingerprint(root) for root in self.data]
 
     def is_trained(self, config: FitConfig) -> bool:
         """Has a configuration's training come to its end?"""
         return (self.run_of(config) / "trained.json").exists()
 
-    def train(self, config: FitConfig) -> Path:
-        """The run of a configuration: made now, continued, or there already.
+    def train(self, config: FitConfig, *, stage: Literal[1, 2] = 2) -> Path:
+        """The run with a stage of a configuration's training: made now, continued, or there already.
 
         Raises:
             KeyboardInterrupt: a signal ended the training early; it has saved.
         """
+        parts = parts_of(config)
+        run = self._train_part(parts[0], None)
+        if stage == 2 and len(parts) > 1:
+            run = self._train_part(parts[1], best_weights(run, 1))
+        return run
+
+    def _train_part(self, config: FitConfig, start: Path | None) -> Path:
+        """A run of `parts_of`; with the weights it starts from, if it is not the first."""
         run = self.run_of(config)
         if self.is_trained(config):
             return run
+        if not self.trains:
+            raise Untrained(run)
+        if start is not None:
+            stage1 = dataclasses.replace(config.stage1, steps=0)
+            config = dataclasses.replace(config, stage1=stage1, start=str(start))
         saved = run / "config.json"
         begun = saved.exists()
         if begun:
             config = fit_config_from_json(saved.read_text(), where=str(saved))
-        start = time.monotonic()
+        begin = time.monotonic()
         if not fit(self.data, run, config, resume=begun, progress=self.progress):
             raise KeyboardInterrupt
-        seconds = round(time.monotonic() - start)
+        seconds = round(time.monotonic() - begin)
         write_text(run / "trained.json", json.dumps({"seconds": seconds, "continued": begun}) + "\n")
         return run
+
+    def needs_training(self, measure: Callable[[Workbench], object]) -> bool:
+        """Would a measurement have to train, because neither its scores nor its network are kept?"""
+        try:
+            measure(dataclasses.replace(self, trains=False))
+        except Untrained:
+            return True
+        return False
+
+    def missing(self, configs: Sequence[FitConfig]) -> tuple[list[FitConfig], list[FitConfig]]:
+        """The runs that trainings still need, each once: those that start afresh, and those that start from them."""
+        rounds: tuple[dict[Path, FitConfig], dict[Path, FitConfig]] = ({}, {})
+        for config in configs:
+            for found, part in zip(rounds, parts_of(config), strict=False):
+                if not self.is_trained(part):
+                    found.setdefault(self.run_of(part), part)
+        return list(rounds[0].values()), list(rounds[1].values())
 
     def train_all(self, configs: Sequence[FitConfig]) -> None:
         """Trains what is not yet trained, `processes` at once. A training has the same bits whichever way it is made.
@@ -125,20 +179,22 @@ class Workbench:
             KeyboardInterrupt: as `train`.
             UserError: one could not be trained; the others that were under way have come to their end.
         """
-        missing = [config for config in configs if not self.is_trained(config)]
-        processes = min(self.processes, len(missing))
-        if processes > 1:
-            quiet = dataclasses.replace(self, progress=False, processes=1)
-            calls = [(quiet, config) for config in missing]
-            run_side_by_side(_train, calls, processes=processes, title="trainings", progress=self.progress)
-            return
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            for config in missing:
-                self.train(config)
-        finally:
-            torch.set_num_threads(threads)
+        for missing in self.missing(configs):
+            processes = min(self.processes, len(missing))
+            if processes > 1:
+                quiet = dataclasses.replace(self, progress=False, processes=1, _loaded={})
+                calls = [(quiet, config) for config in missing]
+                run_side_by_side(
+                    _train, calls, processes=processes, title="trainings", progress=self.progress
+                )
+                continue
+            threads = torch.get_num_threads()
+            torch.set_num_threads(1)
+            try:
+                for config in missing:
+                    self.train(config)
+            finally:
+                torch.set_num_threads(threads)
 
     def scores(
         self,
@@ -186,7 +242,7 @@ class Workbench:
             split: of the first tree.
         """
         data = self.split(config, split)
-        run = self.train(config)
+        run = self.run_of(stage1_of(config) if stage == 1 else config)
 
         def take() -> Scores:
             found = measure(self.network(config, stage=stage), data)
@@ -202,7 +258,7 @@ class Workbench:
         if stage == 0:
             torch.manual_seed(config.seed)
             return build_network(config)
-        run = self.train(config)
+        run = self.train(config, stage=stage)
         has_stage = f"stage{stage}" in config.phases
         return load_predictor(best_weights(run, stage) if has_stage else run)
 
@@ -210,12 +266,10 @@ class Workbench:
         self, answer: Literal["medoid", "nearest image"], config: FitConfig, *, views: int
     ) -> Scores:
         """Figure -> (M,) of an answer that needs no network, for the data that a configuration sees."""
-        config = dataclasses.replace(config, seed=0)  # which changes nothing in the answer
-        test = self.split(config, "test")
+        test, train = self.split(config, "test"), self.split(config, "train")
+        points = build_network(config).points
 
         def take() -> Scores:
-            train = self.split(config, "train")
-            points = load_predictor(self.train(config)).points
             if answer == "medoid":
                 clouds = train.points[medoid(train.points)].expand_as(test.points)
             else:
@@ -224,12 +278,13 @@ class Workbench:
             found = [compare(cloud.contiguous(), truth, points=points) for cloud, truth in parts]
             return {name: torch.cat([part[name] for part in found]).double() for name in found[0]}
 
-        return self.kept([answer, self.run_of(config).name, views, test.fingerprint], take)
+        key = [answer, points, image_size(config), views, train.fingerprint, test.fingerprint]
+        return self.kept(key, take)
 
     def split(self, config: FitConfig, split: Literal["train", "val", "test"]) -> LoadedSplit:
         """A split of the first tree as a configuration reads it; read once."""
         size = image_size(config)
-        key = (split, *size, config.map_size, config.gt_pool, config.categories)
+        key = (self.data[:1], self.limit, split, *size, config.map_size, config.gt_pool, config.categories)
         if key not in self._loaded:
             limit = self.limit if split != "train" else None
             self._loaded[key] = read_split(
@@ -274,12 +329,40 @@ def as_it_is(config: FitConfig) -> FitConfig:
     return config
 
 
+def stage1_of(config: FitConfig) -> FitConfig:
+    """A configuration's training up to the end of stage 1; all of it if it cannot be parted, see `parts_of`."""
+    if config.needs_autoencoder or not config.stage1.steps:
+        return config
+    # As of every training with this stage 1, whatever follows.
+    nothing = dataclasses.replace(config.stage1, steps=0)
+    return dataclasses.replace(config, stage2=nothing, variant="standard")
+
+
+def parts_of(config: FitConfig) -> tuple[FitConfig, ...]:
+    """The runs that a training is made of: stage 1, and the whole, of which the second run trains what is left.
+
+    A critic learns through both stages: such a training is one run, and so is one with a single stage.
+    """
+    first = stage1_of(config)
+    return (first,) if first == config or not config.stage2.steps else (first, config)
+
+
 def _train(bench: Workbench, config: FitConfig) -> None:
     bench.train(config)
 
 
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _own_values(config: Any) -> dict[str, Any]:
+    """A configuration's values that are not their fields' defaults: a field that is new changes no key."""
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if value != field.default:
+            found[field.name] = _own_values(value) if dataclasses.is_dataclass(value) else value
+    return found
 
 
 def _tree_fingerprint(root: Path) -> str:

@@ -1,0 +1,146 @@
+"""Which points of a cloud are hidden, by ray casting against the mesh below it; and how good a guess at them is."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffpoint import PinholeCamera, visible_points
+from diffpoint.visibility import Method
+from train.data.embree import load_embree
+from train.data.procedural import variants_of
+from train.data.render import draw_camera
+from train.data.solids import sample_union, surface_of
+from train.data.surface import Surface
+
+EPSILON = 0.002
+"""World units: what hides a point lies at least so far before it."""
+VIEWS = 8
+_FRAME = 224  # pixels of a side; cameras are resized to each map
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """One shape, sampled, and what hides its samples.
+
+    Attributes:
+        name: of the shape.
+        category: of the shape.
+        camera: (V,) float32.
+        clouds: number of points N -> (N, 3) float32.
+        behind: number of points N -> (V, N) float64: how far each point lies behind what its ray meets first.
+        epsilon: how far a point must lie behind to be hidden.
+    """
+
+    name: str
+    category: str
+    camera: PinholeCamera
+    clouds: dict[int, Tensor]
+    behind: dict[int, Tensor]
+    epsilon: float = EPSILON
+
+    @property
+    def hidden(self) -> dict[int, Tensor]:
+        """Number of points N -> (V, N) bool: what each camera does not see."""
+        return {count: behind > self.epsilon for count, behind in self.behind.items()}
+
+
+def make_scene(
+    name: str,
+    category: str,
+    surface: Surface,
+    counts: Sequence[int],
+    sample: Callable[[int, np.random.Generator], np.ndarray],
+) -> Scene:
+    """A scene of one surface, from 8 of the paper's views.
+
+    Args:
+        name: of the shape.
+        category: of the shape.
+        surface: hides points. Of what lies inside it nothing need be removed: a ray from outside never meets it first.
+        counts: how many points the clouds have.
+        sample: draws that many points (N, 3) on the outside of the surface.
+    """
+    rng = np.random.default_rng(len(surface.faces))
+    rays = Rays(surface)
+    camera = draw_camera(rng, VIEWS, _FRAME)
+    eyes = camera.position.double().numpy()
+    clouds, behind = {}, {}
+    for count in counts:
+        points = sample(count, rng)
+        clouds[count] = torch.from_numpy(points).float()
+        behind[count] = torch.from_numpy(np.stack([rays.behind(eye, points) for eye in eyes]))
+    return Scene(name, category, camera.to(dtype=torch.float32), clouds, behind)
+
+
+def embedded_scene(category: str, seed: int, counts: Sequence[int]) -> Scene:
+    """The scene of an embedded shape, sampled on the outside of the union of its solids."""
+    variants = variants_of(category, seed)
+    solids = variants[seed % len(variants)]
+    sample = functools.partial(sample_union, solids)
+    return make_scene(f"seed {seed}", f"procedural {category}", surface_of(solids), counts, sample)
+
+
+class Rays:
+    """Ray casting against one surface.
+
+    Raises:
+        UserError: embree does not run here.
+    """
+
+    def __init__(self, surface: Surface) -> None:
+        rtcore_scene, mesh_construction = load_embree()
+        self._scene: Any = rtcore_scene.EmbreeScene()
+        mesh_construction.TriangleMesh(
+            scene=self._scene,
+            vertices=np.ascontiguousarray(surface.vertices, np.float32),
+            indices=np.ascontiguousarray(surface.faces, np.int32),
+        )
+
+    def behind(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """(N,) how far each point (N, 3) lies behind what the ray to it meets first; 0 if nothing is before it."""
+        way = points - eye
+        length = np.linalg.norm(way, axis=1)
+        directions = (way / np.maximum(length, 1e-9)[:, None]).astype(np.float32)
+        origins = np.broadcast_to(eye.astype(np.float32), directions.shape).copy()
+        hits = self._scene.run(origins, directions, output=True)
+        return np.where(hits["primID"] >= 0, np.maximum(length - hits["tfar"], 0.0), 0.0)
+
+
+def quality(
+    scenes: Sequence[Scene],
+    count: int,
+    size: int,
+    method: Method,
+    *,
+    radius: float | None = None,
+    tolerance: float | None = None,
+) -> dict[str, float]:
+    """How much of what `visible_points` keeps is hidden, and how much of what is visible it keeps.
+
+    Args:
+        scenes: judged with the epsilon of each.
+        count: points of the clouds.
+        size: pixels of a side of the map.
+        method: see `visible_points`.
+        radius: see `visible_points`.
+        tolerance: see `visible_points`.
+
+    Returns:
+        Means over all views of all scenes: "hidden", the share of hidden points among those kept, and "recall", the
+        share of those kept among the visible ones.
+    """
+    hidden_share, recall = [], []
+    for scene in scenes:
+        camera, cloud = scene.camera.resize(size, size), scene.clouds[count][None]
+        kept = visible_points(cloud, camera, method=method, radius=radius, tolerance=tolerance)[0]
+        hidden = scene.hidden[count]
+        hidden_share.append((kept & hidden).sum(1) / kept.sum(1).clamp(min=1))
+        recall.append((kept & ~hidden).sum(1) / (~hidden).sum(1).clamp(min=1))
+    return {"hidden": float(torch.cat(hidden_share).mean()), "recall": float(torch.cat(recall).mean())}

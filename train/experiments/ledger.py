@@ -1,0 +1,185 @@
+"""All experiments together: which are done, what the rest will cost, and doing it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from train.config import FitConfig, fit_config_from_json
+from train.errors import UserError
+from train.experiments.workbench import Workbench, parts_of
+from train.files import write_text
+
+# Of the cpu profile, on one core of a server of 2024; taken until a run of the same kind has been timed.
+_SECONDS_PER_STEP = {
+    "ours": 0.11, "psgn": 0.11, "psgn-mon": 0.2, "front-mon": 0.15, "lin": 0.1, "r2n2": 0.4, "ptn": 0.2,
+}  # fmt: skip
+
+
+class Experiment(NamedTuple):
+    """What answers a question.
+
+    Attributes:
+        make: trains and measures what is missing, and writes the answer into `bench.out`.
+        configs: every training that it needs.
+    """
+
+    make: Callable[[Workbench], dict[str, Any]]
+    configs: Callable[[Workbench], list[FitConfig]]
+
+
+class Line(NamedTuple):
+    """Where an experiment stands.
+
+    Attributes:
+        name: the experiment's.
+        done: its answer is there, of just this bench.
+        trained: how many of its runs there are.
+        runs: how many it needs, some of which it may share with others.
+        seconds: what the missing runs will take on one core; None if nothing like them was timed yet.
+    """
+
+    name: str
+    done: bool
+    trained: int
+    runs: int
+    seconds: float | None
+
+
+def overview(experiments: Mapping[str, Experiment], bench: Workbench) -> Iterator[Line]:
+    """Says of every experiment where it stands; a missing run that several need counts for the first."""
+    trees = _with_data(bench)
+    speeds, counted = _speeds(bench), set[Path]()
+    for name, experiment in experiments.items():
+        parts = {
+            trees.run_of(part): (part, number > 0)
+            for config in experiment.configs(trees)
+            for number, part in enumerate(parts_of(config))
+        }
+        missing = [run for run, (part, _) in parts.items() if not trees.is_trained(part)]
+        costs = [_seconds(*parts[run], speeds) for run in missing if run not in counted]
+        counted |= set(missing)
+        seconds = None if None in costs else sum(cost for cost in costs if cost is not None)
+        done = is_done(name, experiment, bench)
+        yield Line(name, done, len(parts) - len(missing), len(parts), seconds)
+
+
+def _with_data(bench: Workbench) -> Workbench:
+    trees = bench.on_trees()
+    if not trees.data:
+        raise UserError(
+            f"no data tree among --data {' '.join(map(str, bench.data))}; make one with: "
+            "python -m train data procedural --out DIR"
+        )
+    return trees
+
+
+def is_done(name: str, experiment: Experiment, bench: Workbench) -> bool:
+    """Is an experiment's answer there, and of just these trainings, data, seeds and limits?"""
+    note = bench.out / "done" / f"{name}.json"
+    written = all((bench.out / f"{name}.{kind}").exists() for kind in ("json", "md", "png"))
+    return written and note.exists() and json.loads(note.read_text()) == _key(experiment, bench)
+
+
+def answer(name: str, experiment: Experiment, bench: Workbench) -> dict[str, Any]:
+    """Makes an experiment, and notes that it is done."""
+    result = experiment.make(bench)
+    write_text(bench.out / "done" / f"{name}.json", json.dumps(_key(experiment, bench)) + "\n")
+    return result
+
+
+def answer_all(experiments: Mapping[str, Experiment], bench: Workbench) -> list[str]:
+    """Makes every experiment that is not done yet. One that cannot be made does not keep the others from it.
+
+    Returns:
+        Names of those that were made.
+
+    Raises:
+        UserError: some could not be made; raised at the end, with all reasons.
+    """
+    _with_data(bench)
+    made, failed = [], []
+    for name, experiment in experiments.items():
+        if is_done(name, experiment, bench):
+            continue
+        if bench.progress:
+            print(f"-- {name}", file=sys.stderr)
+        try:
+            answer(name, experiment, bench)
+            made.append(name)
+        except UserError as error:
+            failed.append(f"{name}: {error}")
+    if failed:
+        raise UserError(f"{len(made)} made; these could not be: {'; '.join(failed)}")
+    return made
+
+
+def _key(experiment: Experiment, bench: Workbench) -> dict[str, Any]:
+    """All that an answer depends on."""
+    trees = bench.on_trees()
+    runs = sorted({trees.run_of(config).name for config in experiment.configs(trees)})
+    settings = {
+        field.name: str(getattr(bench, field.name))
+        for field in dataclasses.fields(bench)
+        if field.name not in ("out", "progress", "processes", "data", "trains", "_loaded")
+    }
+    sources = [str(root) for root in bench.data if root not in trees.data]
+    digest = hashlib.sha256("\n".join([*runs, *sources, *trees.fingerprints()]).encode()).hexdigest()[:12]
+    return {"depends_on": digest, **settings}
+
+
+Kind = tuple[str, str, bool, bool]
+"""Runs of one kind take the same time for a step: profile, system, deterministic, stage 2."""
+
+
+def _kind(config: FitConfig, *, second: bool) -> Kind:
+    return config.profile, config.system, config.deterministic, second
+
+
+def _speeds(bench: Workbench) -> dict[Kind, float]:
+    """Seconds per step of the runs that were trained in one go; the newest of each kind."""
+    found: dict[Kind, float] = {}
+    notes = sorted((bench.out / "runs").glob("*/trained.json"), key=lambda path: path.stat().st_mtime)
+    for note in notes:
+        took = json.loads(note.read_text())
+        config = fit_config_from_json((note.parent / "config.json").read_text(), where=str(note.parent))
+        steps = sum(phase.steps for phase in config.phases.values())
+        if not took["continued"]:
+            found[_kind(config, second="stage1" not in config.phases)] = took["seconds"] / steps
+    return found
+
+
+def _seconds(part: FitConfig, second: bool, speeds: Mapping[Kind, float]) -> float | None:
+    """What a run will take: of `parts_of` the first, or the second, which trains stage 2 alone."""
+    alone = second or "stage1" not in part.phases
+    steps = part.stage2.steps if second else sum(phase.steps for phase in part.phases.values())
+    known = speeds.get(_kind(part, second=alone))
+    if known is None and part.profile == "cpu":
+        known = _SECONDS_PER_STEP[part.system]
+    return None if known is None else known * steps
+
+
+def list_lines(lines: list[Line], questions: Mapping[str, str], *, processes: int) -> list[str]:
+    """What `list` prints: one line an experiment, and how long the rest will take."""
+    width = max(len(line.name) for line in lines)
+    printed = []
+    for line in lines:
+        state = "done" if line.done else f"{line.trained}/{line.runs} runs" if line.runs else "to do"
+        cost = "" if line.done or not line.runs else _duration(line.seconds, processes)
+        printed.append(f"{line.name:{width}}  {state:>11}  {cost:>8}  {questions[line.name]}")
+    known = [line.seconds for line in lines if line.seconds is not None]
+    unknown = " and what has no time yet" if len(known) < len(lines) else ""
+    total = _duration(sum(known), processes)
+    return [*printed, f"trainings that are missing: {total}{unknown}, {processes} at once"]
+
+
+def _duration(seconds: float | None, processes: int) -> str:
+    if seconds is None:
+        return "?"
+    minutes = seconds / processes / 60
+    return f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
