@@ -253,6 +253,22 @@ def titles(panels: np.ndarray, words: Sequence[str]) -> None:
         axes.set_title(title, fontsize=11)
 
 
+def headline(figure: Figure, words: str) -> None:
+    """Gives a `figures.grid` a line above the titles of its columns."""
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + 0.3)
+    bottom, top = figure.subplotpars.bottom, figure.subplotpars.top
+    figure.subplots_adjust(bottom=bottom * height / (height + 0.3), top=top * height / (height + 0.3))
+    figure.text(0.5, 1 - 0.08 / (height + 0.3), words, ha="center", va="top", fontsize=12)
+
+
+def caption(axes: Axes, words: str) -> None:
+    """Writes a line at the foot of a cell, legible on whatever is drawn there."""
+    behind = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
+    where = {"transform": axes.transAxes, "ha": "center", "fontsize": 8, "color": MUTED}
+    axes.text(0.5, 0.01, words, bbox=behind, **where)
+
+
 def _sides(upper_and_lower: Sequence[Axes] | np.ndarray) -> None:
     for axes, side in zip(upper_and_lower, ("from the image's side", "from behind"), strict=True):
         axes.text(0, 0.5, side, transform=axes.transAxes, fontsize=8, color=MUTED, rotation=90, va="center")

@@ -13,11 +13,14 @@ QUESTIONS = {
     "views": "the error from 1 to 8 images",
     "runtime": "time of view sampling, and how much of what it selects is hidden",
     "predictions": "several codes for one image: do they differ where the image does not tell?",
+    "reconstructions": "pictures: reconstructions from eight views beside other methods",
+    "one-armed": "does a network without codes invent the hidden arm of a chair, and ours with two views not?",
     "coverage": "do the codes reach all backs that a front can have, and is anything drawn that is none of them?",
     "critic": "with the latent critic and without",
     "agreement": "search and descent in detail: step sizes, steps, groups and restraints",
     "health": "which choices keep a network listening to its image",
     "front-vs-projection": "free clouds and networks, moved by the front constraint and by projection losses",
+    "photos": "pictures: what our system makes of your own photographs (--pictures)",
 }
 """Name of an experiment -> its question, in the order in which `all` takes them."""
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from train.config import FitConfig
 from train.errors import UserError
-from train.experiments import coverage, loss_trainings
+from train.experiments import coverage, loss_trainings, one_armed, photos, reconstructions
 from train.experiments.agreement import agreement
 from train.experiments.correlation import correlation
 from train.experiments.critic import critic
@@ -52,9 +52,12 @@ EXPERIMENTS: dict[str, Experiment] = {
     "predictions": Experiment(predictions, _ours),
     "coverage": Experiment(coverage.coverage, coverage.configs),
     "runtime": Experiment(runtime, lambda bench: []),
+    "reconstructions": Experiment(reconstructions.reconstructions, reconstructions.configs),
+    "one-armed": Experiment(one_armed.one_armed, one_armed.configs),
     "agreement": Experiment(_agreement, lambda bench: _ours(bench)[:1]),
     "health": Experiment(health, lambda bench: []),
     "front-vs-projection": Experiment(front_vs_projection, loss_trainings.configs),
+    "photos": Experiment(lambda bench: photos.photos(bench, bench.pictures), photos.configs),
 }
 """All experiments, by the names of `train.questions.QUESTIONS`."""
 
@@ -98,8 +101,4 @@ def run_all(bench: Workbench) -> None:
 
 def _wanted(bench: Workbench) -> dict[str, Experiment]:
     """All experiments, in the order of their questions; that on photographs if there are any."""
-    return {
-        name: EXPERIMENTS[name]
-        for name in QUESTIONS
-        if name in EXPERIMENTS and (name != "photos" or bench.pictures)
-    }
+    return {name: EXPERIMENTS[name] for name in QUESTIONS if name != "photos" or bench.pictures}

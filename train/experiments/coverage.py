@@ -336,7 +336,7 @@ def _figure(bench: Workbench, hiders: list[Hider], size: int, result: Mapping[st
         everything = torch.cat([obj.backs.flatten(0, 1), clouds.flatten(0, 1)])
         _, close = figures.close_up(torch.ones(1, 3, 128, 128), _one(side), everything)
         figures.draw_image(row[0], obj.image)
-        row[0].set_ylabel(hider.category, fontsize=9)
+        figures.caption(row[0], hider.category)
         for axes, back in zip(row[1:], obj.backs, strict=False):
             figures.draw_cloud(axes, back, close[0], colours=figures.TRUE)
         for axes, cloud, away in zip(row[1 + kinds :], clouds, distances, strict=True):
