@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ from PIL import Image
 from diffpoint import chamfer_distance, unproject
 from train.__main__ import main
 from train.errors import UserError
+from train.experiments import front_vs_projection_page as page
+from train.experiments import loss_trainings_page as networks_page
 from train.experiments.free_clouds import LOSSES, fit_cloud
 from train.experiments.front_vs_projection import run
 from train.experiments.study_shapes import Cameras, embedded_shape, shapes_of
@@ -140,3 +143,13 @@ def test_the_command_reaches_the_study(tmp_path: Path, capsys: pytest.CaptureFix
     words = ["experiment", "front-vs-projection", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main([*words, "--steps", "5"]) == 2
     assert "a fit of 5 steps goes nowhere" in capsys.readouterr().err
+
+
+def test_the_published_page_shows_what_was_measured():
+    docs = Path(__file__).parents[1] / "docs"
+    found = json.loads((docs / "results" / "front-vs-projection.json").read_text())
+    text = (docs / "front-vs-projection.md").read_text()
+    made = page.markdown(found) + networks_page.markdown(found["networks"])
+    rows = [line for line in made.splitlines() if line.startswith("| ") and re.search(r" ± | to ", line)]
+    assert len(rows) > 50
+    assert [row for row in rows if row not in text] == []

@@ -71,6 +71,8 @@ def overview(experiments: Mapping[str, Experiment], bench: Workbench) -> Iterato
 
 def _with_data(bench: Workbench) -> Workbench:
     trees = bench.on_trees()
+    if not bench.data:
+        raise UserError("no data; name one or more data trees with --data")
     if not trees.data:
         raise UserError(
             f"no data tree among --data {' '.join(map(str, bench.data))}; make one with: "
