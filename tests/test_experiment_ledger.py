@@ -13,7 +13,7 @@ import pytest
 from train.config import FitConfig
 from train.errors import UserError
 from train.experiments import EXPERIMENTS, Workbench, write_page
-from train.experiments.ledger import Experiment, answer_all, is_done, list_lines, overview
+from train.experiments.ledger import Experiment, answer, answer_all, is_done, list_lines, overview
 from train.experiments.paper import TABLES, deterministic, second_stage_without_diversity, without_critic
 from train.experiments.table import markdown
 from train.experiments.workbench import stage1_of
@@ -126,6 +126,14 @@ def test_what_an_answer_was_made_from_belongs_to_it(bench: Workbench) -> None:
     assert is_done("views", plain, bench)
     other = Experiment(_write("views"), lambda bench: [bench.config(deterministic, seed=0)])
     assert not is_done("views", other, bench)
+
+
+def test_what_needs_no_data_is_made_without(tmp_path: Path) -> None:
+    bench = Workbench((), tmp_path, "smoke")
+    experiment = Experiment(_write("runtime"), _shared)
+    answer("runtime", experiment, bench)
+    assert is_done("runtime", experiment, bench)
+    assert not is_done("runtime", experiment, dataclasses.replace(bench, data=(Path("meshes.zip"),)))
 
 
 def test_without_data_nothing_is_listed(tmp_path: Path) -> None:

@@ -124,14 +124,16 @@ def answer_all(experiments: Mapping[str, Experiment], bench: Workbench) -> list[
 def _key(experiment: Experiment, bench: Workbench) -> dict[str, Any]:
     """All that an answer depends on."""
     trees = bench.on_trees()
-    runs = sorted({trees.run_of(config).name for config in experiment.configs(trees)})
+    depends = [str(root) for root in bench.data if root not in trees.data]
+    if trees.data:  # some experiments need none
+        depends += trees.fingerprints()
+        depends += sorted({trees.run_of(config).name for config in experiment.configs(trees)})
     settings = {
         field.name: str(getattr(bench, field.name))
         for field in dataclasses.fields(bench)
         if field.name not in ("out", "progress", "processes", "data", "trains", "_loaded")
     }
-    sources = [str(root) for root in bench.data if root not in trees.data]
-    digest = hashlib.sha256("\n".join([*runs, *sources, *trees.fingerprints()]).encode()).hexdigest()[:12]
+    digest = hashlib.sha256("\n".join(depends).encode()).hexdigest()[:12]
     return {"depends_on": digest, **settings}
 
 
