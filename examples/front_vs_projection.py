@@ -20,9 +20,9 @@ from pathlib import Path
 
 import torch
 
-from train.experiments.free_clouds import LOSSES, Fit, fit_cloud
-from train.experiments.front_vs_projection_page import DRAWN, ONE, clouds
-from train.experiments.study_shapes import Cameras, embedded_shape
+from train.experiments.front_vs_projection.free_clouds import LOSSES, Fit, fit_cloud
+from train.experiments.front_vs_projection.page import DRAWN, ONE, clouds
+from train.experiments.front_vs_projection.shapes import Cameras, embedded_shape
 from train.figures import save
 
 SHAPES = ("chair", "table", "sofa")

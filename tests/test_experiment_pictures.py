@@ -21,8 +21,7 @@ from train.data.photos import convert_photos
 from train.data.procedural import generate
 from train.data.solids import Solid
 from train.errors import UserError
-from train.experiments.one_armed import configs, one_armed, presence
-from train.experiments.one_armed_chairs import (
+from train.experiments.one_armed.chairs import (
     HIDDEN,
     SEED,
     SHOWN,
@@ -33,6 +32,7 @@ from train.experiments.one_armed_chairs import (
     one_armed_chairs,
     without,
 )
+from train.experiments.one_armed.measure import configs, one_armed, presence
 from train.experiments.photos import photos, read_objects
 from train.experiments.reconstructions import picked, reconstructions
 from train.experiments.workbench import Workbench

@@ -31,7 +31,7 @@ _JOINED_POINTS = 512
 
 
 # Footprints of the soft projection loss: from a ninth of the map, so that points far from the silhouette reach it, to
-# three quarters of a pixel at half of the stage. The radii of the free clouds in train/experiments/free_clouds.py.
+# three quarters of a pixel at half of the stage: the radii of the study on free clouds.
 _SOFT_START_SHARE, _SOFT_END_PIXELS = 1 / 9, 0.75
 
 _LIN_UPSAMPLE = 2

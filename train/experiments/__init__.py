@@ -7,13 +7,14 @@ from typing import Any
 
 from train.config import FitConfig
 from train.errors import UserError
-from train.experiments import coverage, loss_trainings, one_armed, photos, reconstructions
+from train.experiments import coverage, photos, reconstructions
 from train.experiments.agreement import agreement
 from train.experiments.correlation import correlation
 from train.experiments.critic import critic
-from train.experiments.front_vs_projection import front_vs_projection
+from train.experiments.front_vs_projection import networks, study
 from train.experiments.health import health
 from train.experiments.ledger import Experiment, answer, answer_all, list_lines, overview
+from train.experiments.one_armed import measure
 from train.experiments.page import write_page
 from train.experiments.paper import TABLES
 from train.experiments.predictions import predictions
@@ -53,10 +54,10 @@ EXPERIMENTS: dict[str, Experiment] = {
     "coverage": Experiment(coverage.coverage, coverage.configs),
     "runtime": Experiment(runtime, lambda bench: []),
     "reconstructions": Experiment(reconstructions.reconstructions, reconstructions.configs),
-    "one-armed": Experiment(one_armed.one_armed, one_armed.configs),
+    "one-armed": Experiment(measure.one_armed, measure.configs),
     "agreement": Experiment(_agreement, lambda bench: _ours(bench)[:1]),
     "health": Experiment(health, lambda bench: []),
-    "front-vs-projection": Experiment(front_vs_projection, loss_trainings.configs),
+    "front-vs-projection": Experiment(study.front_vs_projection, networks.configs),
     "photos": Experiment(lambda bench: photos.photos(bench, bench.pictures), photos.configs),
 }
 """All experiments, by the names of `train.questions.QUESTIONS`."""

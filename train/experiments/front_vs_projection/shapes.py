@@ -31,7 +31,7 @@ from train.errors import UserError
 EMBEDDED = ("chair", "car", "airplane")
 SIZE = 56
 """Pixels of a side of the depth maps, as in the paper."""
-_LABELS = Path(__file__).parents[1] / "data" / "furniture_labels.csv"
+_LABELS = Path(__file__).parents[2] / "data" / "furniture_labels.csv"
 _SURFACE = 4096
 _ELEVATION_DEG = 15.0
 _GOLDEN_DEG = 180 * (3 - 5**0.5)

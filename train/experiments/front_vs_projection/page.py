@@ -15,8 +15,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from train.experiments.free_clouds import LOSSES, MEASURED_EVERY, Fit, fit_cloud
-from train.experiments.study_shapes import Cameras, Scene, StudyShape
+from train.experiments.front_vs_projection.free_clouds import LOSSES, MEASURED_EVERY, Fit, fit_cloud
+from train.experiments.front_vs_projection.shapes import Cameras, Scene, StudyShape
 from train.figures import save
 from train.files import replacing
 from train.metrics import in_silhouette

@@ -17,9 +17,9 @@ from models.sizes import PROFILES as SIZES
 from train.config import PROFILES
 from train.errors import UserError
 from train.experiments import Workbench
-from train.experiments.free_clouds import LOSSES
-from train.experiments.front_vs_projection import front_vs_projection
-from train.experiments.loss_trainings import TAUGHT, configs, densities, verdict
+from train.experiments.front_vs_projection.free_clouds import LOSSES
+from train.experiments.front_vs_projection.networks import TAUGHT, configs, densities, verdict
+from train.experiments.front_vs_projection.study import front_vs_projection
 from train.metrics import in_silhouette, visible_error
 from train.objective import Scene, supervise
 from train.systems import build_network
@@ -32,13 +32,13 @@ def test_the_whole_study_trains_measures_and_resumes(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without the free clouds, which have tests of their own."""
-    study = importlib.import_module("train.experiments.front_vs_projection")
+    study = importlib.import_module("train.experiments.front_vs_projection.study")
     monkeypatch.setattr(study, "run", lambda *_, **__: {"fits": [], "table": {}})
     monkeypatch.setattr(study.page, "markdown", lambda found: "free clouds\n")
     for alike in ("projection", "soft"):
         monkeypatch.delitem(TAUGHT, alike)
     bench = Workbench((tiny_data,), tmp_path, "smoke", seeds=1, limit=3, steps=2, progress=False)
-    monkeypatch.setattr("train.experiments.loss_trainings._VIEWS", 2)
+    monkeypatch.setattr("train.experiments.front_vs_projection.networks._VIEWS", 2)
     found = front_vs_projection(bench)
     networks = found["networks"]
     assert list(networks["single"]) == list(TAUGHT)

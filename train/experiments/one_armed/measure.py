@@ -21,8 +21,8 @@ from train.data import ShapeTree
 from train.data.categories import SYNSET_OF
 from train.data.rules import hider_of
 from train.errors import UserError
-from train.experiments.one_armed_chairs import RULES, SEED, Arms, OneArmedChair, one_armed_chairs
-from train.experiments.one_armed_page import CODED, COLUMNS, DRAWN, PLAIN, PSGN, ROWS, TWO, figure, page
+from train.experiments.one_armed.chairs import RULES, SEED, Arms, OneArmedChair, one_armed_chairs
+from train.experiments.one_armed.page import CODED, COLUMNS, DRAWN, PLAIN, PSGN, ROWS, TWO, figure, page
 from train.experiments.paper import deterministic
 from train.experiments.table import judged
 from train.experiments.workbench import Change, Workbench, as_it_is

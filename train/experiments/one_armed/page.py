@@ -15,7 +15,7 @@ from torch import Tensor
 from diffpoint import PinholeCamera, project
 from train import figures
 from train.data.render import orbit_camera
-from train.experiments.one_armed_chairs import SEED, make_chair
+from train.experiments.one_armed.chairs import SEED, make_chair
 from train.experiments.table import claim_lines, table_lines, trainings
 from train.scoring import Scores
 

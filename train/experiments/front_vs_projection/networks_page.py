@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from diffpoint import PinholeCamera
 from train import figures
-from train.experiments.loss_trainings import TAUGHT, Examples
+from train.experiments.front_vs_projection.networks import TAUGHT, Examples
 from train.experiments.table import table_row
 
 _FLOOR = "points of the true surface"

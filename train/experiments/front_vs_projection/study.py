@@ -23,11 +23,10 @@ from tqdm import tqdm
 
 from train import figures
 from train.errors import UserError
-from train.experiments import front_vs_projection_page as page
-from train.experiments import loss_trainings_page as networks_page
-from train.experiments.free_clouds import LOSSES, Fit, fit_cloud
-from train.experiments.loss_trainings import examples, study
-from train.experiments.study_shapes import (
+from train.experiments.front_vs_projection import networks_page, page
+from train.experiments.front_vs_projection.free_clouds import LOSSES, Fit, fit_cloud
+from train.experiments.front_vs_projection.networks import examples, study
+from train.experiments.front_vs_projection.shapes import (
     EMBEDDED,
     Cameras,
     Scene,
@@ -62,7 +61,7 @@ def front_vs_projection(bench: Workbench) -> dict[str, Any]:
     """The whole study: free clouds on all of the bench's data, and networks on its data trees, if there are any.
 
     Returns:
-        What front-vs-projection.json holds; "networks" is what `loss_trainings.study` found.
+        What front-vs-projection.json holds; "networks" is what `networks.study` found.
     """
     found = run(
         bench.data,
@@ -99,7 +98,7 @@ def run(
     """Fits every cloud that has not been fitted yet, then writes tables, figures and an animation into `out`.
 
     Args:
-        data: data trees and sources of meshes; see `study_shapes.shapes_of`. Embedded shapes take part in any case.
+        data: data trees and sources of meshes; see `shapes.shapes_of`. Embedded shapes take part in any case.
         out: directory to write to.
         seeds: random starts and turns of the cameras, for every shape.
         limit: shapes of each kind: embedded, meshes, and each tree; 2 if not given.

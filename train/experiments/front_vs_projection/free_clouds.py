@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import chamfer_distance, front_constraint, projection_loss, soft_projection_loss
-from train.experiments.study_shapes import Scene
+from train.experiments.front_vs_projection.shapes import Scene
 from train.metrics import in_silhouette, visible_error
 
 MEASURED_EVERY = 10
@@ -101,7 +101,7 @@ def fit_cloud(scene: Scene, loss: Loss, *, iterations: int, rate: float, kept: S
         kept: numbers of iterations after which copies of the cloud are kept.
 
     Example:
-        >>> from train.experiments.study_shapes import Cameras, embedded_shape
+        >>> from train.experiments.front_vs_projection.shapes import Cameras, embedded_shape
         >>> scene = embedded_shape("chair").scene(Cameras(1), seed=0, points=64)
         >>> fit_cloud(scene, LOSSES["projection"], iterations=3, rate=0.01).largest_sideways
         0.0

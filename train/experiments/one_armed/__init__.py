@@ -1,0 +1,1 @@
+"""A chair with one arm: is the other one invented? Start reading at measure.py."""
