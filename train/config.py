@@ -227,7 +227,7 @@ class FitConfig:
     log_every: int = 10
     """Steps between lines in metrics.jsonl."""
     picture_every: int = 1_000
-    """Steps between pictures of predictions in figures/."""
+    """Steps between pictures of predictions in figures/; 0: none."""
 
     @property
     def stages(self) -> tuple[StageConfig, StageConfig]:

@@ -131,7 +131,8 @@ def _run_phase(training: Training, run: _Run) -> bool:
                 run.log.write(training.total_steps, record)
                 shown |= _bar_values(record)
                 bar.set_postfix(shown, refresh=False)
-            if world.writes and training.phase_name != "autoencoder" and due(config.picture_every):
+            drawn = config.picture_every > 0 and training.phase_name != "autoencoder"
+            if world.writes and drawn and due(config.picture_every):
                 picture = run.out / "figures" / f"predictions-{training.total_steps:08d}.png"
                 draw_predictions(training.learner.generator, run.val, picture, seed=config.seed)
             if world.writes and (stop or due(config.checkpoint_every)):

@@ -103,7 +103,8 @@ class Workbench:
 
     def config(self, change: Change, *, seed: int) -> FitConfig:
         """The profile's configuration with a variant's changes."""
-        config = dataclasses.replace(change(PROFILES[self.profile]), seed=seed)
+        # Nobody looks at the pictures of dozens of runs.
+        config = dataclasses.replace(change(PROFILES[self.profile]), seed=seed, picture_every=0)
         return config if self.steps is None else with_steps(config, self.steps)
 
     def run_of(self, config: FitConfig) -> Path:
