@@ -15,9 +15,10 @@ from train.errors import UserError
 from train.experiments.workbench import Workbench, parts_of
 from train.files import write_text
 
-# Of the cpu profile, on one core of a server of 2024; taken until a run of the same kind has been timed.
+# Of the cpu profile, processor time on one core of an Intel Xeon of 2024; taken until a run of the same kind has been
+# timed.
 _SECONDS_PER_STEP = {
-    "ours": 0.11, "psgn": 0.11, "psgn-mon": 0.2, "front-mon": 0.15, "lin": 0.1, "r2n2": 0.4, "ptn": 0.2,
+    "ours": 0.3, "psgn": 0.15, "psgn-mon": 0.6, "front-mon": 0.31, "lin": 0.07, "r2n2": 0.47, "ptn": 0.17,
 }  # fmt: skip
 
 
