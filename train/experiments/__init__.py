@@ -27,7 +27,7 @@ __all__ = ["EXPERIMENTS", "Workbench", "run_all", "run_experiment", "show_all", 
 
 
 def _ours(bench: Workbench) -> list[FitConfig]:
-    return [bench.config(as_it_is, seed=seed) for seed in range(bench.seeds)]
+    return bench.configs(as_it_is)
 
 
 def _agreement(bench: Workbench, *, run: Path | None = None, views: int = 8) -> dict[str, Any]:

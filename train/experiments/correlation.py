@@ -17,7 +17,7 @@ from torch import Tensor
 
 from train import figures
 from train.config import InferenceConfig
-from train.experiments.table import table_lines, verdict
+from train.experiments.table import table_lines, trainings, verdict
 from train.experiments.workbench import Workbench, as_it_is
 from train.scoring import Scores, stacked
 
@@ -42,7 +42,7 @@ def correlation(bench: Workbench) -> dict[str, Any]:
         is asked for.
     """
     config = bench.config(as_it_is, seed=0)
-    bench.train_all([bench.config(as_it_is, seed=seed) for seed in range(bench.seeds)])
+    bench.train_all(bench.configs(as_it_is))
     views = min(VIEWS, bench.split(config, "test").views)
     agreed, groups = [], []
     for seed in range(bench.seeds):
@@ -176,11 +176,10 @@ _QUESTIONS = {
 
 
 def _markdown(result: Mapping[str, Any]) -> str:
-    trainings = f"{result['seeds']} training{'s' if result['seeds'] > 1 else ''}"
     head = (
         f"Consistency loss and error of {result['shapes']} held-out shapes from {result['views']} views, profile "
-        f"`{result['profile']}`, {trainings}; {result['groups']} groups of random codes. Mean ± standard deviation "
-        "over trainings; in brackets the 90 % interval by bootstrap over trainings and shapes, and its share above "
+        f"`{result['profile']}`, {trainings(result['seeds'])}; {result['groups']} groups of random "
+        "codes. Mean ± standard deviation over trainings; in brackets the 90 % interval by bootstrap over trainings and shapes, and its share above "
         f"what is asked for: {LEAST_OVER_SHAPES} over shapes, 0 within shapes."
     )
     rows = []

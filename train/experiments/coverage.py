@@ -29,7 +29,7 @@ from train.data.rules import Hider, hider_of
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
 from train.experiments.paper import deterministic
-from train.experiments.table import table_lines
+from train.experiments.table import table_lines, trainings
 from train.experiments.workbench import Workbench, as_it_is
 from train.scoring import Scores
 
@@ -289,10 +289,10 @@ _COLUMNS = {
 
 
 def _markdown(result: Mapping[str, Any]) -> str:
-    trainings = f"{result['seeds']} training{'s' if result['seeds'] > 1 else ''} of each"
     head = (
         f"{result['objects']} held-out objects whose front hides one of three backs, profile `{result['profile']}`, "
-        f"{trainings}. Reached: share of an object's backs that are the nearest of some prediction, and nearer than "
+        f"{trainings(result['seeds'])} of each. Reached: share of an object's backs that are the nearest of some "
+        "prediction, and nearer than "
         "half the smallest distance between two of its backs. Near none: share of predictions with no back so near. "
         "Distance: mean over predictions, 1 is as near as that. Only points count that tell the backs apart, except in "
         "the last two columns."

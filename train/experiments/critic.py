@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from train import figures
 from train.experiments.paper import CRITIC, with_critic
-from train.experiments.table import make
+from train.experiments.table import make, trainings
 from train.experiments.workbench import Workbench
 from train.files import write_text
 from train.log import read_metrics
@@ -76,5 +76,5 @@ def _figure(runs: list[Path]) -> Figure:
     for axes in (left, right):
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.suptitle(f"{len(runs)} training{'s' if len(runs) > 1 else ''}, running means", fontsize=11)
+    figure.suptitle(f"{trainings(len(runs))}, running means", fontsize=11)
     return figure

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from train.errors import UserError
-from train.experiments.table import table_row
+from train.experiments.table import claim_cells, table_row
 from train.files import write_text
 from train.questions import QUESTIONS
 
@@ -64,9 +64,7 @@ def _summary(groups: Mapping[Path, Mapping[str, Mapping[str, Any]]], *, several:
     for folder, found in groups.items():
         for name, result in found.items():
             for claim in result.get("claims", ()):
-                paper = "" if claim.get("paper_gain") is None else f"{claim['paper_gain']:+.2f}"
-                cells = [name, claim["words"], f"{claim['gain']:+.2f}", paper, f"{claim['confidence']:.1%}"]
-                yield table_row([*([folder.name] if several else []), *cells, claim["verdict"]])
+                yield table_row([*([folder.name] if several else []), name, *claim_cells(claim)])
 
 
 def _section(folder: Path, name: str, result: Mapping[str, Any], beside: Path) -> str:

@@ -48,7 +48,7 @@ class _Object(NamedTuple):
 
 def configs(bench: Workbench) -> list[FitConfig]:
     """Every training that the figure needs."""
-    return [bench.config(as_it_is, seed=seed) for seed in range(bench.seeds)]
+    return bench.configs(as_it_is)
 
 
 def photos(bench: Workbench, pictures: Path | None) -> dict[str, Any]:

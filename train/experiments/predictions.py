@@ -15,7 +15,7 @@ from train import figures
 from train.batches import LoadedSplit
 from train.data import ShapeTree
 from train.errors import UserError
-from train.experiments.table import judged, table_lines
+from train.experiments.table import judged, table_lines, trainings
 from train.experiments.workbench import Workbench, as_it_is
 from train.report import make_example, pick_shapes
 from train.scoring import SHAPES_AT_ONCE, Scores, stacked, view_order
@@ -35,7 +35,7 @@ def predictions(bench: Workbench) -> dict[str, Any]:
         What predictions.json holds: "front", "back" (x100) and "ratio" over all shapes and by category, and the share
         of bootstrap samples, over trainings and shapes, in which the back varies more than 1.5 times as much.
     """
-    configs = [bench.config(as_it_is, seed=seed) for seed in range(bench.seeds)]
+    configs = bench.configs(as_it_is)
     bench.train_all(configs)
     test = bench.split(configs[0], "test")
     by_seed = []
@@ -126,11 +126,10 @@ def _summary(scores: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def _markdown(result: Mapping[str, Any]) -> str:
-    trainings = f"{result['seeds']} training{'s' if result['seeds'] > 1 else ''}"
     head = (
         f"{result['codes']} codes for one image of each of {result['shapes']} held-out shapes, profile "
-        f"`{result['profile']}`, {trainings}. Spread x100: mean distance of a point from its mean place over the "
-        "codes, for the points that the image's camera sees and for those behind; surface: from the nearest point of "
+        f"`{result['profile']}`, {trainings(result['seeds'])}. Spread x100: mean distance of a point "
+        "from its mean place over the codes, for the points that the image's camera sees and for those behind; surface: from the nearest point of "
         f"another prediction. The back varies more than {LEAST_RATIO} times as much as the front in "
         f"{result['claims'][0]['confidence']:.1%} of the bootstrap samples over trainings and shapes."
     )

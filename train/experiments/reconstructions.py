@@ -14,11 +14,11 @@ from train import figures
 from train.batches import LoadedSplit
 from train.config import FitConfig
 from train.data.tree import read_shape
+from train.experiments.paper import of_system
 from train.experiments.table import table_lines
 from train.experiments.workbench import Change, Workbench, as_it_is
 from train.inference import reconstruct
 from train.metrics import cloud_errors, thin_out
-from train.recipes import with_system
 from train.scoring import Scores, view_order
 
 VIEWS = 8
@@ -30,8 +30,8 @@ _SHOWN_VIEWS = 4
 
 _METHODS: dict[str, tuple[Change, Literal["all", "first"]]] = {
     "ours": (as_it_is, "all"),
-    "PSGN": (lambda config: with_system(config, "psgn"), "first"),
-    "3D-R2N2": (lambda config: with_system(config, "r2n2"), "all"),
+    "PSGN": (of_system("psgn"), "first"),
+    "3D-R2N2": (of_system("r2n2"), "all"),
 }
 """Method -> how its training differs from the profile's, and which of the images it gets."""
 

@@ -7,7 +7,6 @@ paired bootstrap over shapes and trainings and a verdict in words.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -16,10 +15,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from train import figures
 from train.config import FitConfig, InferenceConfig
 from train.experiments.workbench import Change, Workbench, as_it_is, stage1_of
-from train.files import write_text
 from train.scoring import Scores, stacked
 
 NAMES = {
@@ -199,9 +196,7 @@ def make(table: Table, bench: Workbench) -> dict[str, Any]:
     }
     if table.category_claims:
         result["categories"] = _categories(table, scores, kinds)
-    write_text(bench.out / f"{table.name}.json", json.dumps(result, indent=2) + "\n")
-    write_text(bench.out / f"{table.name}.md", markdown(result))
-    figures.save(_figure(result), bench.out / f"{table.name}.png")
+    bench.publish(table.name, result, markdown(result), _figure(result))
     return result
 
 
@@ -322,20 +317,14 @@ def trainings(count: int) -> str:
 def claim_lines(claims: Sequence[Mapping[str, Any]]) -> list[str]:
     """A Markdown table of verdicts."""
     lines = [table_row(["claim", "gain", "paper's", "confidence", ""]), "| --- | ---: | ---: | ---: | --- |"]
-    for claim in claims:
-        paper = "" if claim["paper_gain"] is None else f"{claim['paper_gain']:+.2f}"
-        lines.append(
-            table_row(
-                [
-                    claim["words"],
-                    f"{claim['gain']:+.2f}",
-                    paper,
-                    f"{claim['confidence']:.1%}",
-                    claim["verdict"],
-                ]
-            )
-        )
-    return lines
+    return [*lines, *(table_row(claim_cells(claim)) for claim in claims)]
+
+
+def claim_cells(claim: Mapping[str, Any]) -> list[str]:
+    """A claim, its gain here and in the paper, the bootstrap's confidence, the verdict."""
+    paper = claim.get("paper_gain")
+    theirs = "" if paper is None else f"{paper:+.2f}"
+    return [claim["words"], f"{claim['gain']:+.2f}", theirs, f"{claim['confidence']:.1%}", claim["verdict"]]
 
 
 def _category_lines(result: Mapping[str, Any]) -> list[str]:

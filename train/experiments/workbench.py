@@ -107,6 +107,10 @@ class Workbench:
         config = dataclasses.replace(change(PROFILES[self.profile]), seed=seed, picture_every=0)
         return config if self.steps is None else with_steps(config, self.steps)
 
+    def configs(self, change: Change) -> list[FitConfig]:
+        """A variant's configuration with every seed."""
+        return [self.config(change, seed=seed) for seed in range(self.seeds)]
+
     def run_of(self, config: FitConfig) -> Path:
         """Where a configuration's run is kept."""
         values = {k: v for k, v in _own_values(config).items() if k not in _NO_PART_OF_A_KEY}

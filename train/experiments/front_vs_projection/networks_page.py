@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from diffpoint import PinholeCamera
 from train import figures
 from train.experiments.front_vs_projection.networks import TAUGHT, Examples
-from train.experiments.table import table_row
+from train.experiments.table import table_row, trainings
 
 _FLOOR = "points of the true surface"
 _SINGLE = {
@@ -108,9 +108,8 @@ def _value(cell: Mapping[str, Any]) -> str:
 def curves(found: Mapping[str, Any]) -> Figure:
     """What validation said on the way: a line for each loss, a band from the lowest to the highest training."""
     figure = Figure(figsize=(14, 8), layout="constrained", dpi=110)
-    trainings = f"{found['seeds']} training{'s' if found['seeds'] > 1 else ''} of each"
     figure.suptitle(
-        f"Networks under each loss: {trainings}; mean, lowest and highest, validation shapes",
+        f"Networks under each loss: {trainings(found['seeds'])} of each; mean, lowest and highest, validation shapes",
         fontsize=14,
         fontweight="bold",
     )

@@ -23,12 +23,11 @@ from train.data.rules import hider_of
 from train.errors import UserError
 from train.experiments.one_armed.chairs import RULES, SEED, Arms, OneArmedChair, one_armed_chairs
 from train.experiments.one_armed.page import CODED, COLUMNS, DRAWN, PLAIN, PSGN, ROWS, TWO, figure, page
-from train.experiments.paper import deterministic
+from train.experiments.paper import deterministic, of_system
 from train.experiments.table import judged
 from train.experiments.workbench import Change, Workbench, as_it_is
 from train.inference import reconstruct
 from train.metrics import cloud_errors
-from train.recipes import with_system
 from train.scoring import Scores, stacked
 
 CHAIRS = 20
@@ -39,7 +38,7 @@ _TRUE_POINTS = 2048
 _CHANGES: dict[str, Change] = {
     "ours": as_it_is,
     "deterministic": deterministic,
-    "psgn": lambda config: with_system(config, "psgn"),
+    "psgn": of_system("psgn"),
 }
 
 
