@@ -179,7 +179,8 @@ def _markdown(result: Mapping[str, Any]) -> str:
     head = (
         f"Consistency loss and error of {result['shapes']} held-out shapes from {result['views']} views, profile "
         f"`{result['profile']}`, {trainings(result['seeds'])}; {result['groups']} groups of random "
-        "codes. Mean ± standard deviation over trainings; in brackets the 90 % interval by bootstrap over trainings and shapes, and its share above "
+        "codes. Mean ± standard deviation over trainings; "
+        "in brackets the 90 % interval by bootstrap over trainings and shapes, and its share above "
         f"what is asked for: {LEAST_OVER_SHAPES} over shapes, 0 within shapes."
     )
     rows = []

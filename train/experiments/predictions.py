@@ -129,7 +129,8 @@ def _markdown(result: Mapping[str, Any]) -> str:
     head = (
         f"{result['codes']} codes for one image of each of {result['shapes']} held-out shapes, profile "
         f"`{result['profile']}`, {trainings(result['seeds'])}. Spread x100: mean distance of a point "
-        "from its mean place over the codes, for the points that the image's camera sees and for those behind; surface: from the nearest point of "
+        "from its mean place over the codes, for "
+        "the points that the image's camera sees and for those behind; surface: from the nearest point of "
         f"another prediction. The back varies more than {LEAST_RATIO} times as much as the front in "
         f"{result['claims'][0]['confidence']:.1%} of the bootstrap samples over trainings and shapes."
     )
