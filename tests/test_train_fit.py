@@ -229,8 +229,8 @@ def test_a_training_starts_with_the_weights_of_another(
         stage2=dataclasses.replace(_SMOKE.stage2, steps=2, gamma=0.0),
     )
     split = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, progress=False)
+    fresh = list(Training(dataclasses.replace(config, start=None), split).learner.generator.parameters())
     training = Training(config, split)
-    fresh = [p.clone() for p in training.learner.generator.parameters()]
     training.begin_phase("stage2", tmp_path)
     saved = load_generator(best_weights(smoke_run, 1)).parameters()
     assert all(torch.equal(a, b) for a, b in zip(training.learner.generator.parameters(), saved, strict=True))
@@ -252,6 +252,12 @@ def test_a_training_starts_with_the_weights_of_another(
     assert main([*fit_it, "--out", str(tmp_path / "same")]) == 0
     assert main([*fit_it, "--out", str(tmp_path / "other"), "--deterministic"]) == 2
     assert "holds the weights of another network" in capsys.readouterr().err
+    # Before anything is trained, and nothing is left behind.
+    nowhere = [*fit_it[:-1], str(tmp_path / "nowhere"), "--out", str(tmp_path / "none")]
+    assert main(nowhere) == 2
+    assert "does not exist" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+    assert not (tmp_path / "none").exists()
 
 
 def test_resuming_a_finished_run_changes_nothing(tiny_data: Path, smoke_run: Path) -> None:

@@ -55,6 +55,8 @@ class Training:
         autoencoder = build_autoencoder(config.profile)
         critic = Critic()
         self.learner = Learner(generator, critic, autoencoder, _adam(autoencoder), _adam(critic))
+        if config.start:
+            self._take_weights(Path(config.start))
         self._enter(next(iter(config.phases)))
 
     @property
@@ -71,9 +73,6 @@ class Training:
         """A fresh optimiser, from the best weights of the phases before; the critic goes on as it is."""
         self._world.wait()  # until whoever writes has written them
         self._enter(name)
-        first = next(phase for phase in (*self.config.phases, None) if phase != "autoencoder")
-        if self.config.start and name == first:
-            self._take_weights(Path(self.config.start))
         if name == "stage1" and self.config.needs_autoencoder:
             self._take_autoencoder(run)
             if self.learner.generator.ends_in_latent:
