@@ -65,16 +65,21 @@ def close_up(images: Tensor, camera: PinholeCamera, points: Tensor) -> tuple[Ten
         camera: (V,), of H x W pixels.
         points: (P, 3) of the object.
     """
-    height, width = images.shape[-2:]
-    pixels = project(points[None], camera).pixels
-    away = (pixels / pixels.new_tensor([width, height]) - 0.5).abs().max().item()
+    closer = narrowed(camera, points)
+    top, left = (camera.height - closer.height) // 2, (camera.width - closer.width) // 2
+    return images[..., top : camera.height - top, left : camera.width - left], closer
+
+
+def narrowed(camera: PinholeCamera, points: Tensor) -> PinholeCamera:
+    """Cameras (V,) without the margin that none of them needs to show points (P, 3)."""
+    size = points.new_tensor([camera.width, camera.height])
+    away = (project(points[None], camera).pixels / size - 0.5).abs().max().item()
     share = max(0.0, 0.5 - 1.15 * away)
-    top, left = int(share * height), int(share * width)
+    top, left = int(share * camera.height), int(share * camera.width)
     K = camera.K.clone()
     K[..., 0, 2] -= left
     K[..., 1, 2] -= top
-    images = images[..., top : height - top, left : width - left]
-    return images, PinholeCamera(K, camera.cam_from_world, height - 2 * top, width - 2 * left)
+    return PinholeCamera(K, camera.cam_from_world, camera.height - 2 * top, camera.width - 2 * left)
 
 
 def draw_cloud(
@@ -227,7 +232,7 @@ def errors_figure(result: dict[str, Any]) -> Figure:
     axes.minorticks_off()
     axes.set(xlabel="images of the object", ylabel="chamfer distance x100", ylim=(0, None))
     axes.legend(fontsize=9)
-    _plain(axes)
+    plain(axes)
     return figure
 
 
@@ -291,7 +296,7 @@ def _curves(axes: Axes, records: Sequence[dict[str, Any]], names: dict[str, str]
         axes.legend(fontsize=9)
     axes.set_xlabel("step")
     axes.title.set_fontsize(11)
-    _plain(axes)
+    plain(axes)
 
 
 def running_mean(values: np.ndarray, *, share: int) -> np.ndarray:
@@ -300,7 +305,8 @@ def running_mean(values: np.ndarray, *, share: int) -> np.ndarray:
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
 
 
-def _plain(axes: Axes) -> None:
+def plain(axes: Axes) -> None:
+    """A frame of two sides and a faint grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25)
 

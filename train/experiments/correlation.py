@@ -222,8 +222,7 @@ def _figure(result: Mapping[str, Any], agreed: Scores, groups: Scores) -> Figure
         ylabel="chamfer distance x100, less the shape's mean",
     )  # fmt: skip
     for axes in (left, right):
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
+        figures.plain(axes)
     several = f"; shown: seed 0 of {result['seeds']}" if result["seeds"] > 1 else ", seed 0"
     figure.suptitle(
         f"Does disagreement tell the error? {result['shapes']} held-out shapes, {result['views']} views{several}",

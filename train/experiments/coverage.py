@@ -29,7 +29,7 @@ from train.data.rules import Hider, hider_of
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
 from train.experiments.paper import deterministic
-from train.experiments.table import table_lines, trainings
+from train.experiments.table import mean_and_spread, table_lines, trainings
 from train.experiments.workbench import Workbench, as_it_is
 from train.scoring import Scores
 
@@ -315,10 +315,9 @@ def _markdown(result: Mapping[str, Any]) -> str:
 
 
 def _cell(found: Mapping[str, Any], *, percent: bool) -> str:
-    mean, sd = found["mean"], found["sd"]
-    if percent:
-        return f"{mean:.0%}" + ("" if sd is None else f" ± {100 * sd:.0f}")
-    return f"{mean:.2f}" + ("" if sd is None else f" ± {sd:.2f}")
+    if not percent:
+        return mean_and_spread(found)
+    return f"{found['mean']:.0%}" + ("" if found["sd"] is None else f" ± {100 * found['sd']:.0f}")
 
 
 def _figure(bench: Workbench, hiders: list[Hider], size: int, result: Mapping[str, Any]) -> Figure:
@@ -327,14 +326,14 @@ def _figure(bench: Workbench, hiders: list[Hider], size: int, result: Mapping[st
     model = bench.network(bench.config(as_it_is, seed=0))
     kinds = FAMILIES[chosen[0].category].modes
     figure, panels = figures.grid(rows=len(chosen), columns=1 + kinds + _SHOWN_CODES)
-    side = orbit_camera(np.array([125.0]), np.array([20.0]), 128)[0].to(dtype=torch.float32)
+    side = orbit_camera(np.array([125.0]), np.array([20.0]), 128).to(dtype=torch.float32)
     for row, hider in zip(panels, chosen, strict=True):
         obj = make_object(hider, size)
         clouds = answers(model, obj.image, _SHOWN_CODES, seed=0)
         near = near_distance(obj.backs, obj.again)
         distances = hidden_distances(clouds, obj.backs)
         everything = torch.cat([obj.backs.flatten(0, 1), clouds.flatten(0, 1)])
-        _, close = figures.close_up(torch.ones(1, 3, 128, 128), _one(side), everything)
+        close = figures.narrowed(side, everything)
         figures.draw_image(row[0], obj.image)
         figures.caption(row[0], hider.category)
         for axes, back in zip(row[1:], obj.backs, strict=False):
@@ -351,7 +350,3 @@ def _figure(bench: Workbench, hiders: list[Hider], size: int, result: Mapping[st
     ]
     figures.titles(panels, heads)
     return figure
-
-
-def _one(camera: PinholeCamera) -> PinholeCamera:
-    return PinholeCamera(camera.K[None], camera.cam_from_world[None], camera.height, camera.width)

@@ -74,7 +74,6 @@ def _figure(runs: list[Path]) -> Figure:
         title="How far predictions are behind", xlabel="step", ylabel="their score - that of real shapes"
     )
     for axes in (left, right):
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
+        figures.plain(axes)
     figure.suptitle(f"{trainings(len(runs))}, running means", fontsize=11)
     return figure

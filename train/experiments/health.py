@@ -231,7 +231,7 @@ def _figure(result: Mapping[str, Any]) -> Figure:
         )  # fmt: skip
         axes.set_yscale("symlog", linthresh=0.1)
         axes.set_ylim(-0.01, None)
-        axes.spines[["top", "right"]].set_visible(False)
+        figures.plain(axes)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", fontsize=9, frameon=False)
     figure.suptitle(f"{result['seeds']} seeds of each, profile {result['profile']}", fontsize=11)

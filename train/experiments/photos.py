@@ -189,7 +189,7 @@ def _figure(result: Mapping[str, Any], objects: Sequence[_Object], answers: Sequ
             line[0], f"{found.name}, {len(found.pictures)} picture{'s' if len(found.pictures) > 1 else ''}"
         )
         everything = torch.cat([made["agreed"], made["one"].flatten(0, 1)])
-        _, close = figures.close_up(torch.ones(1, 3, 128, 128), front, everything)
+        close = figures.narrowed(front, everything)
         for axes, cloud in zip(line[_SHOWN_PICTURES:-2], made["one"], strict=True):
             figures.draw_cloud(axes, cloud, close[0])
         for axes, camera in zip(line[-2:], (close[0], figures.from_behind(close[0])), strict=True):

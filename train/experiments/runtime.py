@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from diffpoint import runtime_info, sample_view, splat_depth, visible_points
 from diffpoint.visibility import Method
+from train import figures
 from train.data.families import FAMILIES
 from train.data.render import Orbit
 from train.experiments.hidden_points import EPSILON, VIEWS, Scene, embedded_scene, quality
@@ -168,10 +169,10 @@ def _markdown(result: Mapping[str, Any]) -> str:
     )
     times, shares = [], []
     for ours, paper in zip(result["time"], result["paper"], strict=True):
-        figures = (f"{ours[name]:.2f}" for name in ("zbuffer", "horizon", "triangulation"))
-        times.append([_points(ours), *figures, f"{ours[_RATIO]:.0f}"])
-        figures = (f"{paper['zbuffer']:.1f}", "", f"{paper['triangulation']:.1f}", f"{paper[_RATIO]:.0f}")
-        times.append([f"{_points(paper)}, the paper", *figures])
+        ours_ms = (f"{ours[name]:.2f}" for name in ("zbuffer", "horizon", "triangulation"))
+        times.append([_points(ours), *ours_ms, f"{ours[_RATIO]:.0f}"])
+        theirs_ms = (f"{paper['zbuffer']:.1f}", "", f"{paper['triangulation']:.1f}", f"{paper[_RATIO]:.0f}")
+        times.append([f"{_points(paper)}, the paper", *theirs_ms])
     hidden = {row["points"]: f"{row['hidden']:.1%}" for row in result["paper"]}
     for base in result["base"]:
         where = {name: base[name] for name in ("points", "epsilon")}
@@ -243,8 +244,7 @@ def _figure(result: Mapping[str, Any]) -> Figure:
         axes.set_xscale("log", base=2)
         axes.set_xticks(result["sides"], [str(side) for side in result["sides"]])
         axes.set(xlabel="side of the map, pixels", ylim=(0, None))
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
+        figures.plain(axes)
         axes.legend(fontsize=8, frameon=False)
     figure.suptitle(f"What view based sampling selects: {_about(result)}, eps = {epsilon}", fontsize=11)
     return figure

@@ -15,6 +15,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from train import figures
 from train.config import FitConfig, InferenceConfig
 from train.experiments.workbench import Change, Workbench, as_it_is, stage1_of
 from train.scoring import Scores, stacked
@@ -357,9 +358,19 @@ def _category_lines(result: Mapping[str, Any]) -> list[str]:
 def _cell(row: Mapping[str, Any], column: str) -> str:
     if column not in row["mean"]:
         return ""
-    sd, paper = row["sd"][column], row["paper"].get(column)
-    text = f"{row['mean'][column]:.2f}" + ("" if sd is None else f" ± {sd:.2f}")
+    paper = row["paper"].get(column)
+    text = mean_and_spread({"mean": row["mean"][column], "sd": row["sd"][column]})
     return text if paper is None else f"{text} ({paper:.2f})"
+
+
+def mean_and_spread(found: Mapping[str, Any]) -> str:
+    """A figure's mean and its standard deviation over trainings, if there is one.
+
+    Example:
+        >>> mean_and_spread({"mean": 1.0, "sd": 0.126})
+        '1.00 ± 0.13'
+    """
+    return f"{found['mean']:.2f}" + ("" if found["sd"] is None else f" ± {found['sd']:.2f}")
 
 
 def table_row(cells: Sequence[str]) -> str:
@@ -386,8 +397,8 @@ def _figure(result: Mapping[str, Any]) -> Figure:
             axes.barh(height, result["rows"][name]["mean"][column], color="#cfe8e0", height=0.6)
             axes.plot(values, [height] * len(values), "o", color="#1f6f8b", ms=5)
         axes.set(xlabel=f"{NAMES[column]} x100", xlim=(0, None))
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.25, axis="x")
+        figures.plain(axes)
+        axes.grid(visible=False, axis="y")
     panels[0].set_yticks(range(len(rows)), rows)
     panels[0].invert_yaxis()
     of = f"{result['shapes']} shapes, {trainings(result['seeds'])} of each"

@@ -22,6 +22,7 @@ import torch
 from safetensors.torch import load, save
 
 from models import Predictor
+from train import figures
 from train.batches import LoadedSplit
 from train.checkpoint import best_weights, load_predictor
 from train.config import PROFILES, FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
@@ -313,8 +314,6 @@ class Workbench:
 
     def publish(self, name: str, result: Mapping[str, Any], page: str, figure: Figure) -> None:
         """Writes NAME.json, NAME.md and NAME.png."""
-        from train import figures  # matplotlib takes a second to import
-
         write_text(self.out / f"{name}.json", json.dumps(result, indent=2) + "\n")
         write_text(self.out / f"{name}.md", page)
         figures.save(figure, self.out / f"{name}.png")

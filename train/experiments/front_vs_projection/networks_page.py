@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from diffpoint import PinholeCamera
 from train import figures
 from train.experiments.front_vs_projection.networks import TAUGHT, Examples
-from train.experiments.table import table_row, trainings
+from train.experiments.table import mean_and_spread, table_row, trainings
 
 _FLOOR = "points of the true surface"
 _SINGLE = {
@@ -70,7 +70,9 @@ def markdown(found: Mapping[str, Any]) -> str:
     ]
     for name, taught in TAUGHT.items():
         for stage in ("stage1", "stage2"):
-            cells = [_value(single[name][stage][figure]) for figure in ("front_density", "imbalance")]
+            cells = [
+                mean_and_spread(single[name][stage][figure]) for figure in ("front_density", "imbalance")
+            ]
             lines.append(table_row([taught.name, stage.replace("stage", "stage "), *cells]))
     floor = [f"{found['floor'][figure]:.2f}" for figure in ("front_density", "imbalance")]
     lines.append(table_row([_FLOOR, "", *floor]))
@@ -81,7 +83,7 @@ def _table(rows: Mapping[str, Any], stage: str, *, verdicts: bool = False) -> li
     head = ["loss", *_SINGLE.values(), *(["error left", "converged?"] if verdicts else [])]
     lines = [table_row(head), table_row(["---", *["---:"] * (len(head) - 1)])]
     for name, row in rows.items():
-        cells = [TAUGHT[name].name, *(_value(row[stage][figure]) for figure in _SINGLE)]
+        cells = [TAUGHT[name].name, *(mean_and_spread(row[stage][figure]) for figure in _SINGLE)]
         if verdicts:
             left = [curve["left"] for curve in row["curves"]]
             cells += [_between(left), _counted(curve["verdict"] for curve in row["curves"])]
@@ -99,10 +101,6 @@ def _counted(verdicts: Any) -> str:
     if len(counts) == 1:
         return next(iter(counts))
     return ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
-
-
-def _value(cell: Mapping[str, Any]) -> str:
-    return f"{cell['mean']:.2f}" + ("" if cell["sd"] is None else f" ± {cell['sd']:.2f}")
 
 
 def curves(found: Mapping[str, Any]) -> Figure:
@@ -126,8 +124,7 @@ def curves(found: Mapping[str, Any]) -> Figure:
             axes.set(title=title, xlabel="step", ylabel=label)
             if name == "inside":
                 axes.set_ylim(0, 1)
-            axes.grid(alpha=0.25)
-            axes.spines[["top", "right"]].set_visible(False)
+            figures.plain(axes)
     rows[0, 0].legend(fontsize=8)
     return figure
 

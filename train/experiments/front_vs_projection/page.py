@@ -15,9 +15,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from train import figures
 from train.experiments.front_vs_projection.free_clouds import LOSSES, MEASURED_EVERY, Fit, fit_cloud
 from train.experiments.front_vs_projection.shapes import Cameras, Scene, StudyShape
-from train.figures import save
 from train.files import replacing
 from train.metrics import in_silhouette
 
@@ -140,7 +140,7 @@ def draw(
     found: Mapping[str, Any], shape: StudyShape, out: Path, *, iterations: int, rates: Mapping[str, float]
 ) -> None:
     """The curves of all fits; the clouds of one shape as a figure, and moving, if one view is in the study."""
-    save(curves(found), out / "front-vs-projection.png")
+    figures.save(curves(found), out / "front-vs-projection.png")
     if ONE.name not in found["table"]:
         return
     kept = range(0, iterations + 1, max(1, iterations // 40))
@@ -152,7 +152,7 @@ def draw(
         for loss in DRAWN
     }
     drawn = {cameras: scene for cameras, scene in scenes.items() if scene is not None}
-    save(clouds(drawn, fits, shape.name), out / "front-vs-projection-clouds.png")
+    figures.save(clouds(drawn, fits, shape.name), out / "front-vs-projection-clouds.png")
     one = {loss: fit for (cameras, loss), fit in fits.items() if cameras == ONE}
     animate(drawn[ONE], one, out / "front-vs-projection-clouds.gif")
 
@@ -195,8 +195,7 @@ def curves(found: Mapping[str, Any]) -> Figure:
     last.set(xlabel="iteration", ylabel=f"{MEASURES['visible_cd']}, {cameras[0]}", yscale="log")
     last.legend(fontsize=8)
     for axes in figure.axes:
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
+        figures.plain(axes)
     return figure
 
 

@@ -16,7 +16,7 @@ from diffpoint import PinholeCamera, project
 from train import figures
 from train.data.render import orbit_camera
 from train.experiments.one_armed.chairs import SEED, make_chair
-from train.experiments.table import claim_lines, table_lines, trainings
+from train.experiments.table import claim_lines, mean_and_spread, table_lines, trainings
 from train.scoring import Scores
 
 ROWS = PLAIN, _, PSGN, _, CODED, TWO, TRUTH = (
@@ -49,7 +49,9 @@ def page(result: Mapping[str, Any]) -> str:
         f"({changed['B']:.1%}). Points in the box of an arm, as a share of those of a real arm: 0 is no arm, 1 a whole "
         "one; mean ± standard deviation over trainings."
     )
-    rows = [[name, *(_cell(row[column]) for column in COLUMNS)] for name, row in result["rows"].items()]
+    rows = [
+        [name, *(mean_and_spread(row[column]) for column in COLUMNS)] for name, row in result["rows"].items()
+    ]
     single = (
         f"Of {codes['number']} random codes for view A, the one that draws least of the missing arm draws "
         f"{codes['least']:.2f} of it, the one that draws most {codes['most']:.2f} (means over chairs); "
@@ -60,10 +62,6 @@ def page(result: Mapping[str, Any]) -> str:
     for paragraph in (single, _caution(result["rows"]), sure):
         lines += ["", paragraph]
     return "\n".join([*lines, "", *claim_lines(result["claims"]), ""])
-
-
-def _cell(found: Mapping[str, Any]) -> str:
-    return f"{found['mean']:.2f}" + ("" if found["sd"] is None else f" ± {found['sd']:.2f}")
 
 
 def _caution(rows: Mapping[str, Any]) -> str:
@@ -110,7 +108,7 @@ def figure(
         eye = orbit_camera(np.array([-20.0 * side]), np.array([35.0]), 128).to(dtype=torch.float32)
         boxes = known["boxes"][number].float()
         everything = torch.cat([known["one, truth"][number], boxes.flatten(0, 1)])
-        _, close = figures.close_up(torch.ones(1, 3, 128, 128), eye, everything)
+        close = figures.narrowed(eye, everything)
         for axes, name in zip(line[2:], columns, strict=True):
             cloud = clouds[name][number]
             colours = figures.TRUE if name == TRUTH else figures.PREDICTED
