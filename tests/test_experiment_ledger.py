@@ -128,6 +128,25 @@ def test_what_an_answer_was_made_from_belongs_to_it(bench: Workbench) -> None:
     assert not is_done("views", other, bench)
 
 
+def test_other_photographs_are_another_answer(bench: Workbench, tmp_path: Path) -> None:
+    pictures = tmp_path / "pictures"
+    (pictures / "chair").mkdir(parents=True)
+    (pictures / "chair" / "1.png").write_bytes(b"one")
+    of = {"photos": Experiment(_write("photos"), lambda bench: [], EXPERIMENTS["photos"].files)}
+    shown = dataclasses.replace(bench, pictures=pictures)
+    plain = {"views": Experiment(_write("views"), lambda bench: [])}
+    answer_all(of | plain, shown)
+    assert answer_all(of | plain, shown) == []
+    (pictures / "chair" / "1.png").write_bytes(b"two")
+    assert answer_all(of | plain, shown) == ["photos"]
+    # What is about neither photographs nor one category stays as it is.
+    assert answer_all(plain, dataclasses.replace(bench, category="display")) == []
+    single = EXPERIMENTS["single-category"]
+    answer("single-category", Experiment(_write("single-category"), single.configs), bench)
+    assert is_done("single-category", single, bench)
+    assert not is_done("single-category", single, dataclasses.replace(bench, category="display"))
+
+
 def test_what_needs_no_data_is_made_without(tmp_path: Path) -> None:
     bench = Workbench((), tmp_path, "smoke")
     experiment = Experiment(_write("runtime"), _shared)

@@ -58,7 +58,11 @@ EXPERIMENTS: dict[str, Experiment] = {
     "agreement": Experiment(_agreement, lambda bench: _ours(bench)[:1]),
     "health": Experiment(health, lambda bench: []),
     "front-vs-projection": Experiment(study.front_vs_projection, networks.configs),
-    "photos": Experiment(lambda bench: photos.photos(bench, bench.pictures), photos.configs),
+    "photos": Experiment(
+        lambda bench: photos.photos(bench, bench.pictures),
+        photos.configs,
+        lambda bench: photos.files(bench.pictures),
+    ),
 }
 """All experiments, by the names of `train.questions.QUESTIONS`."""
 

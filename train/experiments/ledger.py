@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import sys
@@ -28,10 +27,12 @@ class Experiment(NamedTuple):
     Attributes:
         make: trains and measures what is missing, and writes the answer into `bench.out`.
         configs: every training that it needs.
+        files: what it reads beside data trees; with other bytes in them, the answer is another one.
     """
 
     make: Callable[[Workbench], dict[str, Any]]
     configs: Callable[[Workbench], list[FitConfig]]
+    files: Callable[[Workbench], list[Path]] = lambda bench: []
 
 
 class Line(NamedTuple):
@@ -123,18 +124,15 @@ def answer_all(experiments: Mapping[str, Experiment], bench: Workbench) -> list[
 
 
 def _key(experiment: Experiment, bench: Workbench) -> dict[str, Any]:
-    """All that an answer depends on."""
+    """All that an answer depends on; `category` shows in the trainings."""
     trees = bench.on_trees()
     depends = [str(root) for root in bench.data if root not in trees.data]
+    depends += [hashlib.sha256(path.read_bytes()).hexdigest() for path in experiment.files(bench)]
     if trees.data:  # some experiments need none
         depends += trees.fingerprints()
         depends += sorted({trees.run_of(config).name for config in experiment.configs(trees)})
-    settings = {
-        field.name: str(getattr(bench, field.name))
-        for field in dataclasses.fields(bench)
-        if field.name not in ("out", "progress", "processes", "data", "trains", "_loaded")
-    }
     digest = hashlib.sha256("\n".join(depends).encode()).hexdigest()[:12]
+    settings = {name: getattr(bench, name) for name in ("profile", "seeds", "limit", "steps")}
     return {"depends_on": digest, **settings}
 
 

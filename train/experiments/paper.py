@@ -193,6 +193,8 @@ DETERMINISTIC = Table(
         below("cd", "conditional, without the diversity loss", "deterministic"),
         below("fps_cd", "conditional, without the diversity loss", "deterministic"),
     ),
+    # Where the front hides something, a code has something to say.
+    category_claims=(below("cd", "conditional", "deterministic"),),
 )
 
 CRITIC = Table(

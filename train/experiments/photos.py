@@ -51,6 +51,11 @@ def configs(bench: Workbench) -> list[FitConfig]:
     return bench.configs(as_it_is)
 
 
+def files(pictures: Path | None) -> list[Path]:
+    """All files of a folder of photographs."""
+    return sorted(path for path in pictures.rglob("*") if path.is_file()) if pictures else []
+
+
 def photos(bench: Workbench, pictures: Path | None) -> dict[str, Any]:
     """Reconstructs the objects of a folder of photographs; writes photos.json, .md and .png.
 
