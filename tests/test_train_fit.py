@@ -219,6 +219,28 @@ def test_the_highly_diverse_model_from_the_command_line(
     assert [r["stage"] for r in read_metrics(run)] == [1, 1, 1, 2, 2, 2]
 
 
+@pytest.mark.parametrize("select", ["fps_cd", "last"])
+def test_the_best_weights_are_kept_or_the_last(select: Any, tiny_data: Path, tmp_path: Path) -> None:
+    stage1 = dataclasses.replace(_SMOKE.stage1, select=select, gamma=0.0)
+    stage2 = dataclasses.replace(_SMOKE.stage2, gamma=0.0)
+    config = dataclasses.replace(_SMOKE, stage1=stage1, stage2=stage2)
+    train, val = (
+        load_split(tiny_data, split, image_size=(48, 64), map_size=16, progress=False)
+        for split in ("train", "val")
+    )
+    training = Training(config, train)
+    training.begin_phase("stage1", tmp_path)
+    generator = training.learner.generator
+    good = training.validate_and_keep_best(val, tmp_path)["val_fps_cd"]
+    with torch.no_grad():
+        for parameter in generator.parameters():
+            parameter.mul_(2.0)  # clouds far larger than any object
+    assert training.validate_and_keep_best(val, tmp_path)["val_fps_cd"] > 2 * good
+    kept = load_generator(best_weights(tmp_path, 1)).parameters()
+    same = all(torch.equal(a, b) for a, b in zip(generator.parameters(), kept, strict=True))
+    assert same == (select == "last")
+
+
 def test_a_training_starts_with_the_weights_of_another(
     tiny_data: Path, smoke_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

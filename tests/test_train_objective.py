@@ -146,6 +146,9 @@ def test_the_highly_diverse_model_asks_the_joined_clouds_for_a_whole_object_of_c
     assert stage.exact_alpha == pytest.approx(15)
     assert config.stage1 == PROFILES["full"].stage1
     assert with_variant(PROFILES["full"], "standard") == PROFILES["full"]
+    # Without a critic, for a fifth.
+    small = with_variant(PROFILES["cpu"], "highly-diverse").stage2
+    assert (small.joined_diversity, small.steps, small.exact_alpha) == (True, 800, pytest.approx(80))
 
     torch.manual_seed(0)
     views, codes, clouds = 4, torch.randn(3, 8, 128), torch.rand(3, 8, 300, 3)

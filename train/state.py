@@ -233,16 +233,19 @@ class Training:
         }
 
     def validate_and_keep_best(self, val: LoadedSplit, run: Path) -> dict[str, float]:
-        """Validates, and writes the weights if they are the phase's best so far."""
+        """Validates, and writes the weights if they are the phase's best so far, or the last are asked for."""
         phase, seed = self.phase, self.config.seed
         if isinstance(phase, PretrainConfig):
-            network, select = self.learner.autoencoder, "val_autoencoder_cd"
+            network, select = self.learner.autoencoder, "autoencoder_cd"
             figures = validate_autoencoder(network, val, seed=seed)
         else:
-            network, select = self.learner.generator, f"val_{phase.select}"
+            network, select = self.learner.generator, phase.select
             figures = validate(network, val, seed=seed, world=self._world)
-        if figures[select] < self.best:
-            self.best = figures[select]
+        found = figures.get(
+            f"val_{select}", -math.inf
+        )  # there is no figure "last": what comes later is better
+        if found < self.best or select == "last":
+            self.best = found
             if self._world.writes:
                 save_weights(network, best_weights(run, self.phase_name))
         return figures

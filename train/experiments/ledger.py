@@ -145,7 +145,7 @@ def _kind(config: FitConfig, *, second: bool) -> Kind:
 
 
 def _speeds(bench: Workbench) -> dict[Kind, float]:
-    """Seconds per step of the runs that were trained in one go; the newest of each kind."""
+    """Processor seconds per step of the runs that were trained in one go; the newest of each kind."""
     found: dict[Kind, float] = {}
     notes = sorted((bench.out / "runs").glob("*/trained.json"), key=lambda path: path.stat().st_mtime)
     for note in notes:
