@@ -99,6 +99,10 @@ def test_coverage_is_measured_and_drawn(bench: Workbench) -> None:
     assert rows["ours, 10 codes"]["reached"]["mean"] <= rows["ours, 50 codes"]["reached"]["mean"]
     assert rows["deterministic"]["reached"]["mean"] <= 1 / 3
     assert f"{rows['deterministic']['none']['mean']:.0%}" in text
+    more = rows["highly diverse, 10 codes"]["reached"]["mean"] - rows["ours, 10 codes"]["reached"]["mean"]
+    claim = result["claims"][1]
+    assert claim["words"] == "backs reached, %: ours, 10 codes < highly diverse, 10 codes"
+    assert claim["gain"] == pytest.approx(100 * more) and claim["words"] in text
 
 
 def test_the_backs_themselves_cover_all_backs() -> None:

@@ -28,10 +28,10 @@ from train.data.render import Renderer, orbit_camera
 from train.data.rules import Hider, hider_of
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
-from train.experiments.paper import deterministic
-from train.experiments.table import mean_and_spread, table_lines, trainings
-from train.experiments.workbench import Workbench, as_it_is
-from train.scoring import Scores
+from train.experiments.paper import deterministic, highly_diverse
+from train.experiments.table import claim_lines, judged, mean_and_spread, table_lines, trainings
+from train.experiments.workbench import Change, Workbench, as_it_is
+from train.scoring import Scores, stacked
 
 CODES = (10, 50)
 APART = 0.04
@@ -39,6 +39,12 @@ APART = 0.04
 NEAR = 0.5
 """Near a back: within this share of the smallest distance between two backs of the object."""
 _SHOWN_CODES = 5
+_NETWORKS: dict[str, tuple[Change, tuple[int, ...]]] = {
+    "ours": (as_it_is, CODES),
+    "highly diverse": (highly_diverse, CODES[:1]),
+    "deterministic": (deterministic, (1,)),
+}
+"""Network -> how its training differs from the profile's, and how many codes it is given."""
 
 
 class Object(NamedTuple):
@@ -60,17 +66,17 @@ class Object(NamedTuple):
 
 
 def configs(bench: Workbench) -> list[FitConfig]:
-    """Our system and the deterministic one, seed by seed."""
+    """Every training that the measurement needs, seed by seed."""
     return [
-        bench.config(change, seed=seed) for seed in range(bench.seeds) for change in (as_it_is, deterministic)
+        bench.config(change, seed=seed) for seed in range(bench.seeds) for change, _ in _NETWORKS.values()
     ]
 
 
 def coverage(bench: Workbench) -> dict[str, Any]:
     """Scores what our system draws for the fronts of held-out objects; writes coverage.json, .md and .png.
 
-    Beside 10 and 50 codes: the deterministic network's one answer; as many random training shapes of the category; and
-    samples of the backs themselves, for which all is reached and nothing is wrong.
+    Beside 10 and 50 codes: 10 of the highly diverse model; the deterministic network's one answer; as many random
+    training shapes of the category; and samples of the backs themselves, for which all is reached and nothing is wrong.
 
     Returns:
         What coverage.json holds: for each row "reached", the share of an object's backs that are reached, and
@@ -99,13 +105,10 @@ def coverage(bench: Workbench) -> dict[str, Any]:
 
     rows: dict[str, list[Scores]] = {}
     for seed in range(bench.seeds):
-        ours, plain = (bench.config(change, seed=seed) for change in (as_it_is, deterministic))
-        for name, found in {
-            "ours": _kept(bench, ours, hiders, needed, codes=CODES, seed=seed),
-            "deterministic": _kept(bench, plain, hiders, needed, codes=(1,), seed=seed),
-        }.items():
+        for name, (change, codes) in _NETWORKS.items():
+            found = _kept(bench, bench.config(change, seed=seed), hiders, needed, codes=codes, seed=seed)
             for count, scores in found.items():
-                rows.setdefault(f"ours, {count} codes" if name == "ours" else name, []).append(scores)
+                rows.setdefault(f"{name}, {count} codes" if count > 1 else name, []).append(scores)
     for name, scores in _without_network(bench, hiders, needed).items():
         rows[name] = [scores]
     result = bench.about(config) | {
@@ -122,9 +125,24 @@ def coverage(bench: Workbench) -> dict[str, Any]:
             }
             for category in dict.fromkeys(h.category for h in hiders)
         },
+        "claims": _claims({name: stacked(found) for name, found in rows.items()}),
     }
     bench.publish("coverage", result, _markdown(result), _figure(bench, hiders, size, result))
     return result
+
+
+def _claims(rows: Mapping[str, Scores]) -> list[dict[str, Any]]:
+    """What codes are for: other backs, and none that there is not."""
+    coded = [f"{name}, {CODES[0]} codes" for name in ("ours", "highly diverse")]
+    reached = [
+        judged(f"backs reached, %: {low} < {high}", 100 * (rows[high]["reached"] - rows[low]["reached"]))
+        for low, high in (("deterministic", coded[0]), coded)
+    ]
+    wrong = [
+        judged(f"near none, %: {name} < {_OTHERS}", 100 * (rows[_OTHERS]["none"] - rows[name]["none"]))
+        for name in coded
+    ]
+    return [*reached, *wrong]
 
 
 def make_object(hider: Hider, size: int) -> Object:
@@ -266,7 +284,7 @@ def _without_network(bench: Workbench, hiders: list[Hider], needed: Any) -> dict
     key = ["coverage", "without network", bench.run_of(config).name, [NEAR, APART], list(map(list, hiders))]
     found = _split_up(bench.kept(key, take), (1, 2))
     return {
-        f"{CODES[0]} random training shapes of the category": found[1],
+        _OTHERS: found[1],
         f"{CODES[0]} samples of the backs": found[2],
     }
 
@@ -279,6 +297,7 @@ def _summary(by_seed: Sequence[Scores]) -> dict[str, Any]:
     }
 
 
+_OTHERS = f"{CODES[0]} random training shapes of the category"
 _COLUMNS = {
     "reached": "backs reached",
     "none": "near none",
@@ -310,6 +329,7 @@ def _markdown(result: Mapping[str, Any]) -> str:
         for category, found in result["categories"].items()
     ]
     lines = [head, "", *table_lines(["", *_COLUMNS.values()], rows)]
+    lines += ["", *claim_lines(result["claims"])]
     lines += ["", "Backs reached / predictions near none, by family:", ""]
     return "\n".join([*lines, *table_lines(["", *first], by_category), ""])
 
