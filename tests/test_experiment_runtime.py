@@ -108,6 +108,11 @@ def test_runtime_is_measured_and_written(tmp_path: Path, monkeypatch: pytest.Mon
     )
 
     page = (tmp_path / "runtime.md").read_text()
+    for claim, row in zip(result["claims"], result["time"], strict=True):
+        by_shape = row["by_shape"]
+        gains = np.array(by_shape["triangulation"]) - 10 * np.array(by_shape["zbuffer"])
+        assert claim["gain"] == pytest.approx(gains.mean())
+        assert claim["words"] in page
     for row in result["grid"]:
         assert f"| {row['hidden']:.1%} / {row['recall']:.1%} |" in page
     for ours, paper in zip(result["time"], ("6.6 |  | 209.8 | 32", "10.2 |  | 1120.0 | 110"), strict=True):
