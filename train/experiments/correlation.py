@@ -204,7 +204,7 @@ def _figure(result: Mapping[str, Any], agreed: Scores, groups: Scores) -> Figure
     r, rho = (result["over_shapes"]["cd"][name]["by_seed"][0] for name in _COEFFICIENTS)
     left.plot(agreed["consistency"], agreed["cd"], "o", ms=4.5, alpha=0.6, mew=0, color="#1f6f8b")
     left.set(
-        title=f"Every shape, agreed codes: r = {r:+.2f}, rho = {rho:+.2f}",
+        title=f"Every shape, agreed codes\nr = {r:+.2f}, rho = {rho:+.2f}",
         xlabel="consistency loss x100", ylabel="chamfer distance to the truth x100",
     )  # fmt: skip
     x, y = ((groups[name] - groups[name].mean(0)).double() for name in ("consistency", "cd"))
@@ -217,7 +217,7 @@ def _figure(result: Mapping[str, Any], agreed: Scores, groups: Scores) -> Figure
     right.axhline(0, color=figures.MUTED, lw=0.6)
     right.axvline(0, color=figures.MUTED, lw=0.6)
     right.set(
-        title=f"{result['groups']} groups of random codes of each shape: mean r = {r:+.2f}, rho = {rho:+.2f}",
+        title=f"{result['groups']} groups of random codes of each shape\nmean r = {r:+.2f}, rho = {rho:+.2f}",
         xlabel="consistency loss x100, less the shape's mean\n(coloured: the shapes whose groups differ most)",
         ylabel="chamfer distance x100, less the shape's mean",
     )  # fmt: skip
