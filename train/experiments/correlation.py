@@ -26,7 +26,7 @@ GROUPS = 20
 LEAST_OVER_SHAPES = 0.3
 """The correlation over shapes that is asked for; within shapes it is any above 0."""
 _RESAMPLES = 2000
-_ERRORS = {"cd": "CD", "fps_cd": "FPS-CD"}
+_ERRORS = {"cd": "CD", "fps_cd": "FPS-CD", "gt_to_pred": "GT->pred", "pred_to_gt": "pred->GT"}
 _SHOWN_WITHIN = 6
 
 
