@@ -17,7 +17,8 @@ from train.files import write_text
 # Of the cpu profile, processor time on one core of an Intel Xeon of 2024; taken until a run of the same kind has been
 # timed.
 _SECONDS_PER_STEP = {
-    "ours": 0.3, "psgn": 0.15, "psgn-mon": 0.6, "front-mon": 0.31, "lin": 0.07, "r2n2": 0.47, "ptn": 0.17,
+    "ours": 0.3, "deterministic": 0.16, "psgn": 0.15, "psgn-mon": 0.6, "front-mon": 0.31,
+    "lin": 0.07, "r2n2": 0.47, "ptn": 0.17,
 }  # fmt: skip
 
 
@@ -163,7 +164,7 @@ def _seconds(part: FitConfig, second: bool, speeds: Mapping[Kind, float]) -> flo
     steps = part.stage2.steps if second else sum(phase.steps for phase in part.phases.values())
     known = speeds.get(_kind(part, second=alone))
     if known is None and part.profile == "cpu":
-        known = _SECONDS_PER_STEP[part.system]
+        known = _SECONDS_PER_STEP["deterministic" if part.deterministic else part.system]
     return None if known is None else known * steps
 
 
