@@ -13,6 +13,7 @@ import trimesh
 
 from train.data import ShapeTree, store
 from train.data.meshes import convert
+from train.data.work import without_interrupts
 
 BOXES = 16
 SETTINGS = {"size": 112, "views": 6}
@@ -90,6 +91,17 @@ def test_an_interrupted_run_ends_at_once_with_one_word(tmp_path):
     assert errors.splitlines()[-1] == "interrupted"
     assert "Traceback" not in errors
     assert ends(run.pid)
+
+
+def test_an_interrupt_while_workers_start_is_answered_when_they_have_started():
+    steps = []
+    with pytest.raises(KeyboardInterrupt), without_interrupts():
+        signal.raise_signal(signal.SIGINT)
+        steps.append("started")
+    assert steps == ["started"]
+    with without_interrupts():
+        steps.append("none came")
+    assert len(steps) == 2
 
 
 @pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs limits of the system")

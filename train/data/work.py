@@ -73,9 +73,9 @@ def _in_pool(
     others = set(multiprocessing.active_children())
     while left:
         pool = ProcessPoolExecutor(min(processes, len(left)), mp_context=context, initializer=_follow_parent)
-        with _without_interrupts(), _without_main():
-            futures = {pool.submit(function, jobs[number]): number for number in left}
         try:
+            with without_interrupts(), _without_main():
+                futures = {pool.submit(function, jobs[number]): number for number in left}
             for future in as_completed(futures):
                 result = future.result()
                 del left[futures[future]]
@@ -95,7 +95,7 @@ def _in_pool(
 def _alone(function: Callable[[Job], Any], job: Job, context: SpawnContext) -> Any:
     with ProcessPoolExecutor(1, mp_context=context, initializer=_follow_parent) as pool:
         try:
-            with _without_interrupts(), _without_main():
+            with without_interrupts(), _without_main():
                 future = pool.submit(function, job)
             return future.result()
         except BrokenProcessPool:
@@ -103,16 +103,26 @@ def _alone(function: Callable[[Job], Any], job: Job, context: SpawnContext) -> A
 
 
 @contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Processes started in this block leave Ctrl-C to their parent, from their first moment on."""
+def without_interrupts() -> Iterator[None]:
+    """Processes started in this block leave Ctrl-C to their parent, from their first moment on.
+
+    One that comes while they start is answered at the block's end.
+    """
     if threading.current_thread() is not threading.main_thread():  # where Python allows no handlers
         yield
         return
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    came: list[bool] = []
+    handler = signal.signal(signal.SIGINT, lambda *_: came.append(True))
+    blocks = hasattr(signal, "pthread_sigmask")  # what is blocked stays so in a child; a handler does not
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if blocks else set()
     try:
         yield
     finally:
+        if blocks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         signal.signal(signal.SIGINT, handler)
+        if came:
+            signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager
