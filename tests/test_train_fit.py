@@ -280,6 +280,12 @@ def test_a_training_starts_with_the_weights_of_another(
     assert "does not exist" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
     assert not (tmp_path / "none").exists()
+    # A run that has begun does not need them any more.
+    start = shutil.copy(best_weights(smoke_run, 1), tmp_path / "start.safetensors")
+    assert main([*fit_it[:-1], str(start), "--out", str(tmp_path / "gone")]) == 0
+    start.unlink()
+    shutil.rmtree(latest_checkpoint(tmp_path / "gone"))
+    assert main(["fit", "--resume", "--data", str(tiny_data), "--out", str(tmp_path / "gone")]) == 0
 
 
 def test_resuming_a_finished_run_changes_nothing(tiny_data: Path, smoke_run: Path) -> None:

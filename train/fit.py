@@ -74,8 +74,9 @@ def fit(
     train, val = read("train"), read("val", limit=config.validation_shapes)
     _check_fits(config, train, world)
     world.wait()  # all have looked at the directory before one writes into it
-    training = Training(config, train, world)
     newest = latest_checkpoint(out)
+    # A checkpoint has weights of its own; those that the run started from may be gone.
+    training = Training(config if newest is None else dataclasses.replace(config, start=None), train, world)
     if newest is not None:
         training.resume(out, newest)
     else:

@@ -241,11 +241,8 @@ class Training:
         else:
             network, select = self.learner.generator, phase.select
             figures = validate(network, val, seed=seed, world=self._world)
-        found = figures.get(
-            f"val_{select}", -math.inf
-        )  # there is no figure "last": what comes later is better
-        if found < self.best or select == "last":
-            self.best = found
+        if select == "last" or figures[f"val_{select}"] < self.best:
+            self.best = figures.get(f"val_{select}", self.best)
             if self._world.writes:
                 save_weights(network, best_weights(run, self.phase_name))
         return figures

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from train import figures
 from train.config import InferenceConfig
-from train.experiments.table import table_lines, trainings, verdict
+from train.experiments.table import NAMES, table_lines, trainings, verdict
 from train.experiments.workbench import Workbench, as_it_is
 from train.scoring import Scores, stacked
 
@@ -26,7 +26,7 @@ GROUPS = 20
 LEAST_OVER_SHAPES = 0.3
 """The correlation over shapes that is asked for; within shapes it is any above 0."""
 _RESAMPLES = 2000
-_ERRORS = {"cd": "CD", "fps_cd": "FPS-CD", "gt_to_pred": "GT->pred", "pred_to_gt": "pred->GT"}
+_ERRORS = ("cd", "fps_cd", "gt_to_pred", "pred_to_gt")
 _SHOWN_WITHIN = 6
 
 
@@ -185,9 +185,9 @@ def _markdown(result: Mapping[str, Any]) -> str:
     )
     rows = []
     for question, words in _QUESTIONS.items():
-        for error, title in _ERRORS.items():
+        for error in _ERRORS:
             found = result[question][error]
-            rows.append([f"{title}, {words}", *(_cell(found[name]) for name in _COEFFICIENTS)])
+            rows.append([f"{NAMES[error]}, {words}", *(_cell(found[name]) for name in _COEFFICIENTS)])
     return "\n".join([head, "", *table_lines(["", "Pearson", "Spearman"], rows), ""])
 
 
