@@ -72,6 +72,15 @@ def test_a_killed_run_leaves_no_process_and_is_finished_by_the_next(tmp_path):
     assert files_of(out) == files_of(tmp_path / "whole")
 
 
+@pytest.fixture
+def heeds_interrupts():
+    """A suite that a shell started in the background ignores SIGINT, and so would the processes that it starts."""
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, handler)
+
+
+@pytest.mark.usefixtures("heeds_interrupts")
 def test_an_interrupted_run_ends_at_once_with_one_word(tmp_path):
     """Also its workers, which a terminal interrupts as well, while they are still starting."""
     save_boxes(tmp_path / "in", 300)  # enough to be at work still on a machine that has other work to do
@@ -93,6 +102,7 @@ def test_an_interrupted_run_ends_at_once_with_one_word(tmp_path):
     assert ends(run.pid)
 
 
+@pytest.mark.usefixtures("heeds_interrupts")
 def test_an_interrupt_while_workers_start_is_answered_when_they_have_started():
     steps = []
     with pytest.raises(KeyboardInterrupt), without_interrupts():
