@@ -17,7 +17,7 @@ def machine() -> dict[str, Any]:
     """What the times belong to."""
     info = diffpoint.runtime_info()
     return {
-        "processor": _processor(),
+        "processor": info.processor,
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
@@ -25,15 +25,6 @@ def machine() -> dict[str, Any]:
         "backend": f"{info.backend} {info.version}",
         "threads": info.threads,
     }
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or "unknown"
 
 
 def title(here: dict[str, Any]) -> str:

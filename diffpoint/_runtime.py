@@ -7,9 +7,11 @@ import importlib
 import importlib.util
 import io
 import os
+import platform
 import sys
 import threading
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -34,6 +36,8 @@ class RuntimeInfo:
     threads: int
     cache: bool
     """Whether compiled kernels are kept on disk for the next process."""
+    processor: str
+    """Name of the processor, as far as the system tells it: what times belong to."""
 
 
 class _Runtime:
@@ -196,4 +200,12 @@ def runtime_info() -> RuntimeInfo:
             owner=owner,
             threads=threads,
             cache=RUNTIME.cache,
+            processor=_processor_name(),
         )
+
+
+def _processor_name() -> str:
+    cpuinfo = Path("/proc/cpuinfo")  # Linux, where `platform` does not know the name
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -8,12 +8,14 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
 
 from diffpoint import PinholeCamera, splat_depth
 from models import Generator
 from models.baselines import (
     Baseline,
+    R2N2Config,
     build_lin,
     build_psgn,
     build_ptn,
@@ -166,6 +168,36 @@ def test_memory_reads_views_in_order_and_all_of_them() -> None:
         other = images.clone()
         other[:, view] = 0.0
         assert (network.logits(other) - logits).abs().max() > 1e-5
+
+
+def test_blocks_of_the_decoder_convolve_the_unpooled_grid() -> None:
+    """As published: each cell goes to one corner of eight, zeros to the others, then two convolutions beside it."""
+    torch.manual_seed(0)
+    network = build_r2n2(config=R2N2Config("odd", 32, 32, 128, (8, 16), (False, True), 64, 6, (6, 8, 4)))
+    for block, channels in zip(network.decoder, (6, 6, 8), strict=True):
+        x = torch.randn(2, channels, 4, 4, 4)
+        before = x
+        if isinstance(block.first, nn.ConvTranspose3d):
+            before = torch.zeros(2, channels, 8, 8, 8)
+            before[..., ::2, ::2, ::2] = x
+
+        def convolved(conv: nn.Module, grid: Tensor) -> Tensor:
+            assert isinstance(conv, (nn.Conv3d, nn.ConvTranspose3d))
+            weight = conv.weight
+            if isinstance(conv, nn.ConvTranspose3d):
+                weight = weight.transpose(0, 1).flip(2, 3, 4)
+            return F.conv3d(grid, weight, conv.bias, padding=weight.shape[-1] // 2)
+
+        twice = F.leaky_relu(block.second(F.leaky_relu(convolved(block.first, before), 0.01)), 0.01)
+        beside = convolved(block.skip, before) if list(block.skip.parameters()) else before
+        torch.testing.assert_close(block(x), twice + beside)
+
+
+def test_an_untrained_grid_is_nearly_empty() -> None:
+    torch.manual_seed(0)
+    with torch.no_grad():
+        logits = build_r2n2("cpu").logits(torch.rand(2, 1, 3, 64, 64))
+    assert 0.01 < logits.softmax(1)[:, 1].mean() < 0.15
 
 
 def _ball(size: int, radius: float) -> Tensor:

@@ -59,8 +59,8 @@ _STAGES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
             {"steps": 40_000, "shapes": 24, "views": 5, "select": "cd", "weight_decay": 5e-5} | _rates(1e-5),
         ),
         "cpu": (
-            {"steps": 1_400, "shapes": 4, "views": 3, "select": "cd"} | _rates(5e-4),
-            {"steps": 600, "shapes": 4, "views": 3, "select": "cd"} | _rates(1e-4, 1e-5),
+            {"steps": 3_000, "shapes": 4, "views": 3, "warmup": 100, "select": "cd"} | _rates(1e-3),
+            {"steps": 1_000, "shapes": 4, "views": 3, "select": "cd"} | _rates(2e-4, 2e-5),
         ),
         "smoke": (
             {"steps": 12, "shapes": 3, "views": 2, "select": "cd"} | _rates(1e-3),

@@ -12,7 +12,6 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -151,14 +150,12 @@ def _hidden(scenes: Sequence[Scene]) -> dict[str, Any]:
 
 def _machine() -> dict[str, Any]:
     """What the times belong to."""
-    cpuinfo = Path("/proc/cpuinfo")  # Linux, where `platform` does not know the processor's name
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    info = runtime_info()
     return {
-        "processor": names[0] if names else platform.processor() or platform.machine(),
+        "processor": info.processor,
         "platform": platform.platform(),
         "cores": os.cpu_count(),
-        "threads": runtime_info().threads,
+        "threads": info.threads,
     }
 
 
