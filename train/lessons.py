@@ -5,7 +5,6 @@ Distances between clouds are means x100, as everywhere in the tables.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -28,9 +27,9 @@ from train.truth import fixed_depth, solid_cells
 
 _PROJECTIONS = 5
 
-# How far above the least a transport may be that only says which of several clouds is nearest. It is 2 % above in the
-# mean, where the clouds of five codes differ by 30 %, and takes half the time.
-_CHOICE_TOLERANCE = 0.2
+# How far above the least a transport may be: of which the network learns, and which only says what cloud is nearest of
+# several. That one is 2 % above in the mean, where the clouds of five codes differ by 30 %, and takes half the time.
+_TOLERANCE, _CHOICE_TOLERANCE = 0.02, 0.2
 
 
 class Given(NamedTuple):
@@ -63,13 +62,12 @@ def whole_clouds(network: Generator, given: Given) -> dict[str, Tensor]:
 
 def best_whole_cloud(network: Generator, given: Given) -> dict[str, Tensor]:
     """Minimum over n: of the clouds of R codes, the one nearest to the true surface learns."""
-    roughly = functools.partial(_cloud_distances, tolerance=_CHOICE_TOLERANCE)
-    return _best_of(network, given, choose=roughly, learn=_cloud_distances)
+    return _best_of(network, given, _cloud_distances)
 
 
 def best_front(network: Generator, given: Given) -> dict[str, Tensor]:
     """Minimum over n of the front constraint."""
-    return _best_of(network, given, choose=_front_distances, learn=_front_distances)
+    return _best_of(network, given, _front_distances)
 
 
 def fixed_views(network: StructureGenerator, given: Given) -> dict[str, Tensor]:
@@ -125,21 +123,20 @@ def outlines(network: SilhouetteReconstruction, given: Given) -> dict[str, Tenso
     return {"loss": 0.5 * (seen - true).square().sum((2, 3)).mean(), "filled_share": occupancy.mean()}
 
 
-_Distances = Callable[[Tensor, Given], Tensor]
-
-
-def _best_of(network: Generator, given: Given, *, choose: _Distances, learn: _Distances) -> dict[str, Tensor]:
+def _best_of(
+    network: Generator, given: Given, distances: Callable[[Tensor, Given, float], Tensor]
+) -> dict[str, Tensor]:
     """The clouds of R codes are compared without a graph; then the best of each image is made again, and learns."""
     images = given.batch.images.flatten(0, 1)
     with torch.no_grad():
-        all_distances = choose(network(images, given.codes), given)  # (R, B*V)
+        all_distances = distances(network(images, given.codes), given, _CHOICE_TOLERANCE)  # (R, B*V)
     best = all_distances.argmin(0)
     codes = given.codes[best, torch.arange(len(best))][None]
-    loss = learn(network(images, codes), given).mean()
+    loss = distances(network(images, codes), given, _TOLERANCE).mean()
     return {"loss": loss, "mean_of_all": all_distances.mean()}
 
 
-def _cloud_distances(clouds: Tensor, given: Given, tolerance: float = 0.02) -> Tensor:
+def _cloud_distances(clouds: Tensor, given: Given, tolerance: float = _TOLERANCE) -> Tensor:
     """(R, B*V, N, 3) clouds -> (R, B*V) distances to the true surfaces, x100; transports within `tolerance`."""
     true = _for_each_image(given.truth.points, given)
     if given.stage.front == "chamfer":
@@ -152,10 +149,10 @@ def _cloud_distances(clouds: Tensor, given: Given, tolerance: float = 0.02) -> T
     return 100 * earth_mover_distance(clouds, thin, tolerance=tolerance).cost
 
 
-def _front_distances(clouds: Tensor, given: Given) -> Tensor:
-    """(R, B*V, N, 3) clouds -> (R, B*V) front constraints, in the paper's unit."""
+def _front_distances(clouds: Tensor, given: Given, tolerance: float) -> Tensor:
+    """(R, B*V, N, 3) clouds -> (R, B*V) front constraints, in the paper's unit; transports within `tolerance`."""
     scene = arrange_scenes(clouds, given.batch.camera, given.batch.depth, joined_views=False)
-    return front_loss(scene, given.stage.front).each.view(clouds.shape[:2])
+    return front_loss(scene, given.stage.front, tolerance=tolerance).each.view(clouds.shape[:2])
 
 
 def _for_each_image(values: Tensor, given: Given) -> Tensor:

@@ -144,12 +144,16 @@ def _same_area(depth: Tensor) -> float:
 
 
 def front_loss(
-    scene: Scene, distance: Literal["emd", "chamfer"], *, visibility: Visibility = "zbuffer"
+    scene: Scene,
+    distance: Literal["emd", "chamfer"],
+    *,
+    visibility: Visibility = "zbuffer",
+    tolerance: float = 0.02,
 ) -> Front:
     """Compares the visible predicted points with the observed points of each view, in the paper's units.
 
-    "emd": earth mover's distance as a SUM over matched points, scaled as if on a 56 x 56 map. "chamfer": both
-    directions, x100.
+    "emd": earth mover's distance as a SUM over matched points, scaled as if on a 56 x 56 map, with transports within
+    `tolerance`. "chamfer": both directions, x100.
     """
     sets = front_sets(scene.points, scene.camera, scene.depth, visibility=visibility)
     if distance == "chamfer":
@@ -163,7 +167,11 @@ def front_loss(
         each = 100 * (terms.a_to_b + terms.b_to_a)
     else:
         transport = earth_mover_distance(
-            sets.predicted, sets.observed, a_lengths=sets.predicted_lengths, b_lengths=sets.observed_lengths
+            sets.predicted,
+            sets.observed,
+            tolerance=tolerance,
+            a_lengths=sets.predicted_lengths,
+            b_lengths=sets.observed_lengths,
         )
         each = _same_area(scene.depth) * transport.cost * _matched(sets)
     shares = {
