@@ -138,14 +138,22 @@ def novelty(model: Generator, test: LoadedSplit, shapes: Tensor, *, seed: int) -
     """
     first = view_order(test, seed)[:, :1]
     generator = torch.Generator().manual_seed(seed)
-    among = shapes[:, : model.points].contiguous()
+    among = shapes[:, : model.points]
     found = []
     for numbers in torch.arange(len(test)).split(SHAPES_AT_ONCE):
         codes = torch.randn(1, len(numbers), model.code_dim, generator=generator)
         clouds = model(test.float_images(numbers, first[numbers])[:, 0], codes)[0]
-        for cloud in clouds:
-            distance = chamfer_distance(cloud.expand(len(among), -1, -1).contiguous(), among, squared=False)
-            found.append(100 * (distance.a_to_b + distance.b_to_a).amin())
+        found.append(distance_to_nearest(clouds, among))
+    return torch.cat(found)
+
+
+def distance_to_nearest(clouds: Tensor, among: Tensor) -> Tensor:
+    """(M, N, 3) clouds, (K, P, 3) others -> (M,) chamfer distance x100 from each cloud to the nearest of the others."""
+    among = among.contiguous()
+    found = []
+    for cloud in clouds:
+        distance = chamfer_distance(cloud.expand(len(among), -1, -1).contiguous(), among, squared=False)
+        found.append(100 * (distance.a_to_b + distance.b_to_a).amin())
     return torch.stack(found)
 
 

@@ -41,7 +41,7 @@ Measure = Callable[["Row", Workbench, FitConfig], Scores]
 
 def reconstructions(row: Row, bench: Workbench, config: FitConfig) -> Scores:
     """What a row's system makes of several images of each shape, beside the truth."""
-    if row.answer != "network":
+    if row.answer in ("medoid", "nearest image"):
         return bench.trivial_scores(row.answer, config, views=row.views)
     settings = config.inference
     if row.codes == "searched":
@@ -67,7 +67,7 @@ class Row:
             "random".
         views: how many.
         scored: see `InferenceConfig`; the system's own way if None.
-        answer: "network", or what is answered instead.
+        answer: "network", or what is answered instead; "truth" needs a `measure` of its own.
         measure: takes the figures.
         paper: the paper's figures.
     """
@@ -78,7 +78,7 @@ class Row:
     codes: Literal["agreed", "agreed as in the paper", "searched", "random"] = "agreed"
     views: int = 8
     scored: Literal["joined", "each"] | None = None
-    answer: Literal["network", "medoid", "nearest image"] = "network"
+    answer: Literal["network", "medoid", "nearest image", "truth"] = "network"
     measure: Measure = reconstructions
     paper: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
