@@ -109,7 +109,7 @@ class RecurrentReconstruction(Baseline):
             if isinstance(module, (_ImageBlock, _GridBlock, _GatedMemory)):
                 module.initialise()
         # Most cells are empty, and the first steps need not be spent on that.
-        self.logits_of_cells.bias.data = torch.tensor([_EMPTIER, -_EMPTIER])
+        self.logits_of_cells.bias = nn.Parameter(torch.tensor([_EMPTIER, -_EMPTIER]))
         # A fifth of a training step's time on a CPU.
         for module in self.modules():
             if isinstance(module, (nn.Conv3d, nn.ConvTranspose3d)):
