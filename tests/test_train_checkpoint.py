@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 from models import build_generator
@@ -56,6 +57,19 @@ def test_what_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=complaint) as caught:
             load_generator(tmp_path / name)
         assert name in str(caught.value)
+
+
+def test_weights_of_another_version_are_called_so(tmp_path: Path) -> None:
+    path = tmp_path / "old.safetensors"
+    save_weights(build_generator("smoke"), path)
+    with safe_open(path, framework="pt") as file:
+        headers, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    name = sorted(tensors)[0]
+    save_file(tensors | {name: torch.zeros(7)}, path, headers)
+    with pytest.raises(
+        UserError, match=rf"old\.safetensors was written by another .*\(1 of them, {name} first\)"
+    ):
+        load_generator(path)
 
 
 def test_an_unreadable_state_is_named(tmp_path: Path) -> None:

@@ -151,6 +151,15 @@ def _read(path: Path, *kinds: type[_Network]) -> _Network:
             raise ValueError(f"it has no {_KINDS[kinds[0]][0]} header")
         name, build = found[0]
         model = build(_with_tuples(json.loads(headers[name])))
+        theirs, ours = (
+            {key: value.shape for key, value in of.items()} for of in (tensors, model.state_dict())
+        )
+        if theirs != ours:
+            odd = sorted({key for key, _ in theirs.items() ^ ours.items()})
+            raise UserError(
+                f"{path} was written by another version of diffpoint: its {type(model).__name__} has other weights "
+                f"({len(odd)} of them, {odd[0]} first); train it anew, or read it with that version"
+            )
         model.load_state_dict(tensors)
     except (SafetensorError, OSError, ValueError, TypeError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -1,8 +1,8 @@
 """How the methods that the paper compares itself with are trained, as changes to a profile's configuration.
 
 Full sizes follow the methods' own publications, with the images, shapes and batches of the paper; where nothing is
-stated, the comment says what is assumed. The cpu profile's lengths let each of them come to rest within a quarter of
-an hour on one core, with the embedded data.
+stated, the comment says what is assumed. The cpu profile's lengths let each of them come to rest within about twenty
+minutes on one core, with the embedded data.
 """
 
 from __future__ import annotations
