@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import importlib.util
 import io
@@ -204,6 +205,7 @@ def runtime_info() -> RuntimeInfo:
         )
 
 
+@functools.cache  # `runtime_info` is asked at every splat
 def _processor_name() -> str:
     cpuinfo = Path("/proc/cpuinfo")  # Linux, where `platform` does not know the name
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
