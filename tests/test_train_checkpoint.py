@@ -70,6 +70,11 @@ def test_weights_of_another_version_are_called_so(tmp_path: Path) -> None:
         UserError, match=rf"old\.safetensors was written by another .*\(1 of them, {name} first\)"
     ):
         load_generator(path)
+    # Nor is such a checkpoint said to be damaged: deleting it would mend nothing.
+    networks = {"old": build_generator("smoke")}
+    with pytest.raises(UserError, match=r"old\.safetensors was written by another") as caught:
+        load_networks(tmp_path, networks)
+    assert "delete" not in str(caught.value)
 
 
 def test_an_unreadable_state_is_named(tmp_path: Path) -> None:

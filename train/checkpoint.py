@@ -51,6 +51,11 @@ from train.systems import system_of
 
 _Network = TypeVar("_Network", bound=nn.Module)
 
+
+class OtherVersionError(UserError):
+    """Sound weights, of a network that this version of diffpoint builds otherwise."""
+
+
 # Under which name a file's header keeps a network's configuration, and how the network is made from it.
 _KINDS = {
     Generator: ("diffpoint.generator", lambda c: build_generator(config=GeneratorConfig(**c))),
@@ -156,7 +161,7 @@ def _read(path: Path, *kinds: type[_Network]) -> _Network:
         )
         if theirs != ours:
             odd = sorted({key for key, _ in theirs.items() ^ ours.items()})
-            raise UserError(
+            raise OtherVersionError(
                 f"{path} was written by another version of diffpoint: its {type(model).__name__} has other weights "
                 f"({len(odd)} of them, {odd[0]} first); train it anew, or read it with that version"
             )
@@ -244,6 +249,8 @@ def _unreadable(directory: Path, name: str) -> Iterator[None]:
     """Says what to do about a damaged part of a checkpoint."""
     try:
         yield
+    except OtherVersionError:  # not damaged; the checkpoint before it is no better
+        raise
     except Exception as error:  # a damaged pickle fails in every way there is
         reason = str(error) if isinstance(error, UserError) else type(error).__name__
         raise UserError(
