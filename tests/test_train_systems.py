@@ -29,7 +29,7 @@ from train.log import read_metrics
 from train.recipes import with_system
 from train.scoring import score
 from train.state import Training
-from train.systems import METHODS, image_size, system_of, taught_step
+from train.systems import METHODS, build_network, cloud_size, image_size, system_of, taught_step
 from train.truth import fixed_depth, solid_cells
 
 _SMOKE = PROFILES["smoke"]
@@ -54,6 +54,12 @@ def test_every_recipe_has_a_lesson_and_a_size_for_each_phase(system: System, pro
     assert method.sizes[profile].points == SIZES[profile].points
     assert [phase.steps for phase in with_steps(config, 7).phases.values()] == [7] * len(method.lessons)
     assert with_steps(config, 7).phases.keys() == config.phases.keys()
+
+
+@pytest.mark.parametrize("system", get_args(System))
+def test_the_size_of_a_cloud_is_known_without_its_network(system: System) -> None:
+    config = with_system(_SMOKE, system)
+    assert cloud_size(config) == build_network(config).points
 
 
 def test_our_own_recipe_is_left_alone() -> None:

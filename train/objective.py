@@ -22,6 +22,9 @@ from train.config import StageConfig
 # weights of the other terms belong to maps of 56 x 56.
 _PAPER_MAP_SIZE = 56
 
+# How far above the least a transport may be of which a network learns.
+TRANSPORT_TOLERANCE = 0.02
+
 # How far above the least the diversity loss may take a transport, where it has to know it at all. It is 2 % above in
 # the mean then, a third faster than at 0.05, and the approximation of the paper's own code is 30 % above.
 _SPREAD_TOLERANCE = 0.2
@@ -148,7 +151,7 @@ def front_loss(
     distance: Literal["emd", "chamfer"],
     *,
     visibility: Visibility = "zbuffer",
-    tolerance: float = 0.02,
+    tolerance: float = TRANSPORT_TOLERANCE,
 ) -> Front:
     """Compares the visible predicted points with the observed points of each view, in the paper's units.
 

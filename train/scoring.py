@@ -138,13 +138,11 @@ def novelty(model: Generator, test: LoadedSplit, shapes: Tensor, *, seed: int) -
     """
     first = view_order(test, seed)[:, :1]
     generator = torch.Generator().manual_seed(seed)
-    among = shapes[:, : model.points]
-    found = []
+    clouds = []
     for numbers in torch.arange(len(test)).split(SHAPES_AT_ONCE):
         codes = torch.randn(1, len(numbers), model.code_dim, generator=generator)
-        clouds = model(test.float_images(numbers, first[numbers])[:, 0], codes)[0]
-        found.append(distance_to_nearest(clouds, among))
-    return torch.cat(found)
+        clouds.append(model(test.float_images(numbers, first[numbers])[:, 0], codes)[0])
+    return distance_to_nearest(torch.cat(clouds), shapes[:, : model.points])
 
 
 def distance_to_nearest(clouds: Tensor, among: Tensor) -> Tensor:

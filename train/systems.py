@@ -121,9 +121,22 @@ def image_size(config: FitConfig) -> tuple[int, int]:
     Raises:
         UserError: as `build_network`.
     """
-    _check(config)
-    size = size_of(config) if config.system == "ours" else METHODS[config.system].sizes[config.profile]
+    size = _network_size(config)
     return size.image_height, size.image_width
+
+
+def cloud_size(config: FitConfig) -> int:
+    """Points of one prediction of a configuration's network, or to how many its clouds are thinned.
+
+    Raises:
+        UserError: as `build_network`.
+    """
+    return _network_size(config).points
+
+
+def _network_size(config: FitConfig) -> GeneratorConfig | BaselineConfig:
+    _check(config)
+    return size_of(config) if config.system == "ours" else METHODS[config.system].sizes[config.profile]
 
 
 def system_of(network: Predictor) -> System:

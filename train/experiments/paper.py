@@ -15,7 +15,7 @@ from train.experiments.table import Claim, Row, Table, below
 from train.experiments.workbench import Change, Workbench, as_it_is
 from train.recipes import with_system
 from train.scoring import SHAPES_AT_ONCE, Scores, distance_to_nearest, diversity, novelty
-from train.systems import build_network
+from train.systems import cloud_size
 
 
 def deterministic(config: FitConfig) -> FitConfig:
@@ -101,7 +101,7 @@ def _spread_of_samples(row: Row, bench: Workbench, config: FitConfig) -> Scores:
     data have points for two, and for shapes that are real."""
     test, train = bench.split(config, "test"), bench.split(config, "train")
     some = _some_shapes(train)
-    available, points = test.points.shape[1], build_network(config).points
+    available, points = test.points.shape[1], cloud_size(config)
     size = min(points, available // 2)
 
     def take() -> Scores:

@@ -32,7 +32,7 @@ from train.files import replacing, write_text
 from train.fit import fit
 from train.runs import read_split
 from train.scoring import Scores, compare, score
-from train.systems import build_network, image_size
+from train.systems import build_network, cloud_size, image_size
 from train.trivial import medoid, nearest_by_image
 
 if TYPE_CHECKING:
@@ -273,7 +273,7 @@ class Workbench:
     ) -> Scores:
         """Figure -> (M,) of an answer that needs no network, for the data that a configuration sees."""
         test, train = self.split(config, "test"), self.split(config, "train")
-        points = build_network(config).points
+        points = cloud_size(config)
 
         def take() -> Scores:
             if answer == "medoid":
