@@ -98,6 +98,19 @@ def test_every_table_of_the_paper_can_be_made(
         assert weighted / result["shapes"] == pytest.approx(result["rows"]["ours"]["mean"]["cd"])
 
 
+def test_true_shapes_are_nearer_than_an_untaught_network_to_what_their_images_show(bench: Workbench) -> None:
+    table = TABLES["diversity"]
+    ours, truth = (
+        next(row for row in table.rows if row.name == name)
+        for name in ("diversity loss, beta 10", "the truth, sampled again")
+    )
+    for seed in range(bench.seeds):
+        network, surface = (
+            row.measure(row, bench, table.config(row, bench, seed=seed))["visible"] for row in (ours, truth)
+        )
+        assert surface.mean() < 0.7 * network.mean()
+
+
 @pytest.mark.parametrize("table", TABLES.values(), ids=lambda table: table.name)
 def test_what_is_claimed_holds_for_the_papers_own_figures(table: Table) -> None:
     paper = {row.name: row.paper for row in table.rows}

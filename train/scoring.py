@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from diffpoint import chamfer_distance, consistency_loss
 from models import Generator, Predictor
-from train.batches import LoadedSplit
+from train.batches import Batch, LoadedSplit
 from train.config import InferenceConfig
 from train.inference import reconstruct
 from train.metrics import cloud_errors, thin_out, transport_error
@@ -81,7 +81,7 @@ def score(
             scores["consistency"] = 100 * consistency_loss(each, reduction="none")
         parts.append(scores)
         done(len(shapes))
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    return joined(parts)
 
 
 def _predictions(model: Predictor, points: Tensor, views: int) -> Tensor | None:
@@ -114,35 +114,35 @@ def compare(predicted: Tensor, truth: Tensor, *, points: int) -> Scores:
 
 
 @torch.no_grad()
-def diversity(model: Generator, test: LoadedSplit, *, codes: int, seed: int) -> Tensor:
-    """(M,) mean chamfer distance x100 between the predictions of one image with `codes` random codes."""
-    first = view_order(test, seed)[:, :1]
-    generator = torch.Generator().manual_seed(seed)
-    found = []
-    for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
-        drawn = torch.randn(codes, len(shapes), model.code_dim, generator=generator)
-        clouds = model(test.float_images(shapes, first[shapes])[:, 0], drawn)
-        found.append(100 * consistency_loss(clouds.transpose(0, 1), reduction="none"))
-    return torch.cat(found)
-
-
-@torch.no_grad()
-def novelty(model: Generator, test: LoadedSplit, shapes: Tensor, *, seed: int) -> Tensor:
-    """(M,) chamfer distance x100 from the prediction of one image, with a random code, to the nearest of some shapes.
+def answers(model: Generator, test: LoadedSplit, *, codes: int, seed: int) -> Iterator[tuple[Batch, Tensor]]:
+    """What a network makes of one image of each shape with several random codes, some shapes at a time.
 
     Args:
         model: takes codes.
         test: the split whose images are shown.
-        shapes: (K, P, 3) true surfaces; as many points of each as the model predicts are used.
+        codes: how many, R.
         seed: draws views and codes.
+
+    Yields:
+        B shapes with the one view that is shown, and (R, B, N, 3) predictions in the world frame.
     """
     first = view_order(test, seed)[:, :1]
     generator = torch.Generator().manual_seed(seed)
-    clouds = []
-    for numbers in torch.arange(len(test)).split(SHAPES_AT_ONCE):
-        codes = torch.randn(1, len(numbers), model.code_dim, generator=generator)
-        clouds.append(model(test.float_images(numbers, first[numbers])[:, 0], codes)[0])
-    return distance_to_nearest(torch.cat(clouds), shapes[:, : model.points])
+    for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
+        shown = test.batch(shapes, first[shapes])
+        drawn = torch.randn(codes, len(shapes), model.code_dim, generator=generator)
+        yield shown, model(shown.images[:, 0], drawn).contiguous()
+
+
+def distance_between(answers: Tensor) -> Tensor:
+    """(R, B, N, 3) several predictions of each image -> (B,) mean chamfer distance x100 between any two of them."""
+    return 100 * consistency_loss(answers.transpose(0, 1), reduction="none")
+
+
+def diversity(model: Generator, test: LoadedSplit, *, codes: int, seed: int) -> Tensor:
+    """(M,) `distance_between` the predictions of one image with `codes` random codes."""
+    found = answers(model, test, codes=codes, seed=seed)
+    return torch.cat([distance_between(clouds) for _, clouds in found])
 
 
 def distance_to_nearest(clouds: Tensor, among: Tensor) -> Tensor:
@@ -159,6 +159,11 @@ def view_order(test: LoadedSplit, seed: int) -> Tensor:
     """(M, V): for each shape its views in this seed's order."""
     generator = torch.Generator().manual_seed(seed)
     return torch.stack([torch.randperm(test.views, generator=generator) for _ in range(len(test))])
+
+
+def joined(parts: Sequence[Scores]) -> Scores:
+    """The scores of some shapes after those of others, (M,)."""
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
 def stacked(by_seed: Sequence[Scores]) -> Scores:

@@ -5,16 +5,25 @@ from __future__ import annotations
 import dataclasses
 
 import torch
+from torch import Tensor
 
-from diffpoint import consistency_loss
 from models import Generator, Predictor
-from train.batches import LoadedSplit
+from train.batches import Batch, LoadedSplit
 from train.config import FitConfig, System, with_variant
 from train.errors import UserError
 from train.experiments.table import Claim, Row, Table, below
 from train.experiments.workbench import Change, Workbench, as_it_is
+from train.metrics import visible_error
 from train.recipes import with_system
-from train.scoring import SHAPES_AT_ONCE, Scores, distance_to_nearest, diversity, novelty
+from train.scoring import (
+    SHAPES_AT_ONCE,
+    Scores,
+    answers,
+    distance_between,
+    distance_to_nearest,
+    joined,
+    view_order,
+)
 from train.systems import cloud_size
 
 
@@ -79,20 +88,23 @@ _NEAREST_AMONG = 300
 
 
 def _spread_of_answers(row: Row, bench: Workbench, config: FitConfig) -> Scores:
-    """Diversity of ten answers to one image, and how far one of them is from the nearest training shape, which tells
-    shapes from noise; both mean chamfer distances x100."""
+    """Ten answers to one image: how far they are apart, from what it shows, and (one of them) from the nearest real
+    shape; the last two tell other shapes from noise. All are chamfer distances x100."""
     train = bench.split(config, "train")
     some = _some_shapes(train)
 
     def measure(model: Predictor, test: LoadedSplit) -> Scores:
         if not isinstance(model, Generator):
             raise UserError(f"{row.name} takes no codes")
-        return {
-            "diversity": diversity(model, test, codes=_ANSWERS, seed=config.seed),
-            "novelty": novelty(model, test, train.points[some], seed=config.seed),
-        }
+        real = train.points[some, : model.points]
+        return joined(
+            [
+                _spread(clouds, shown, real)
+                for shown, clouds in answers(model, test, codes=_ANSWERS, seed=config.seed)
+            ]
+        )
 
-    what = ["diversity", _ANSWERS, train.fingerprint, len(some)]
+    what = ["spread of answers", _ANSWERS, train.fingerprint, len(some)]
     return bench.measured(config, what, measure, stage=row.stage)
 
 
@@ -106,16 +118,34 @@ def _spread_of_samples(row: Row, bench: Workbench, config: FitConfig) -> Scores:
 
     def take() -> Scores:
         order = torch.randperm(available, generator=torch.Generator().manual_seed(config.seed))
-        parts = test.points[:, order].split(size, dim=1)
-        samples = torch.stack([part for part in parts if part.shape[1] == size], dim=1)
-        spread = [100 * consistency_loss(few, reduction="none") for few in samples.split(SHAPES_AT_ONCE)]
-        nearest = distance_to_nearest(samples[:, 0], train.points[some, :points])
-        return {"diversity": torch.cat(spread).double(), "novelty": nearest.double()}
+        samples = [part for part in order.split(size) if len(part) == size]
+        real, first = train.points[some, :points], view_order(test, config.seed)[:, :1]
+        return joined(
+            [
+                _spread(
+                    torch.stack([test.points[shapes][:, sample] for sample in samples]),
+                    test.batch(shapes, first[shapes]),
+                    real,
+                )
+                for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE)
+            ]
+        )
 
-    return bench.kept(["samples", config.seed, points, test.fingerprint, train.fingerprint, len(some)], take)
+    key = ["spread of samples", config.seed, points, test.fingerprint, train.fingerprint, len(some)]
+    return bench.kept(key, take)
 
 
-def _some_shapes(train: LoadedSplit) -> torch.Tensor:
+def _spread(clouds: Tensor, shown: Batch, real: Tensor) -> Scores:
+    visible = [visible_error(cloud, shown.camera, shown.depth)[:, 0] for cloud in clouds]
+    figures = {
+        "diversity": distance_between(clouds),
+        "visible": torch.stack(visible).mean(0),
+        "novelty": distance_to_nearest(clouds[0], real),
+    }
+    return {name: values.double() for name, values in figures.items()}
+
+
+def _some_shapes(train: LoadedSplit) -> Tensor:
     return torch.linspace(0, len(train) - 1, min(_NEAREST_AMONG, len(train))).long()
 
 
@@ -123,7 +153,7 @@ _RESAMPLED = "the truth, sampled again"
 DIVERSITY = Table(
     name="diversity",
     title="How different are ten answers to one image?",
-    columns=("diversity", "novelty"),
+    columns=("diversity", "visible", "novelty"),
     rows=(
         *(
             Row(name=name, change=change, stage=1, measure=_spread_of_answers, paper={"diversity": theirs})

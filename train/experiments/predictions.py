@@ -18,7 +18,7 @@ from train.errors import UserError
 from train.experiments.table import judged, table_lines, trainings
 from train.experiments.workbench import Workbench, as_it_is
 from train.report import make_example, pick_shapes
-from train.scoring import SHAPES_AT_ONCE, Scores, stacked, view_order
+from train.scoring import Scores, answers, joined, stacked
 
 CODES = 6
 SHOWN_CODES, SHOWN_SHAPES = 5, 6
@@ -94,16 +94,9 @@ def spread(clouds: Tensor, camera: PinholeCamera) -> dict[str, Tensor]:
     return found | {"front_share": front.to(mean.dtype).mean(-1)}
 
 
-@torch.no_grad()
 def _spreads(model: Generator, test: LoadedSplit, seed: int) -> Scores:
-    order = view_order(test, seed)[:, :1]
-    generator = torch.Generator().manual_seed(seed)
-    parts = []
-    for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
-        batch = test.batch(shapes, order[shapes])
-        codes = torch.randn(CODES, len(shapes), model.code_dim, generator=generator)
-        parts.append(spread(model(batch.images[:, 0], codes).contiguous(), batch.camera))
-    return {name: torch.cat([part[name] for part in parts]).double() for name in parts[0]}
+    found = [spread(clouds, shown.camera) for shown, clouds in answers(model, test, codes=CODES, seed=seed)]
+    return {name: values.double() for name, values in joined(found).items()}
 
 
 def _generator(bench: Workbench, config: Any) -> Generator:

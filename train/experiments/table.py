@@ -30,6 +30,7 @@ NAMES = {
     "emd": "EMD",
     "consistency": "consistency",
     "diversity": "diversity",
+    "visible": "from what the image shows",
     "novelty": "to the nearest training shape",
 }
 _RESAMPLES = 4000
