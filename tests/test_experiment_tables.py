@@ -261,7 +261,7 @@ def test_what_health_undoes_is_undone() -> None:
     assert first.weight.std() < 0.8 * before
 
 
-def test_the_critic_s_opinion_is_that_of_the_log(bench: Workbench) -> None:
+def test_the_critic_s_opinion_is_that_of_the_log(bench: Workbench, tmp_path: Path) -> None:
     bench = dataclasses.replace(bench, seeds=1)
     result = run_experiment("critic", bench)
     assert set(result["rows"]) == {row.name for row in TABLES["critic"].rows}
@@ -271,6 +271,11 @@ def test_the_critic_s_opinion_is_that_of_the_log(bench: Workbench) -> None:
         sum(scores) / len(scores), rel=0.2
     )
     assert (bench.out / "critic-scores.png").stat().st_size > 10_000
+
+    shutil.move(run, tmp_path / run.name)
+    assert run_experiment("critic", dataclasses.replace(bench, trains=False)) == result, (
+        "opinions outlive runs"
+    )
 
 
 def test_wrong_requests_are_named(bench: Workbench, tmp_path: Path) -> None:

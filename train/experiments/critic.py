@@ -2,60 +2,65 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
 from train import figures
+from train.config import FitConfig
 from train.experiments.paper import CRITIC, with_critic
-from train.experiments.table import make, trainings
+from train.experiments.table import figure, markdown, tabulate, trainings
 from train.experiments.workbench import Workbench
-from train.files import write_text
 from train.log import read_metrics
+from train.scoring import Scores
 
 _PARTS = 10
 
 
 def critic(bench: Workbench) -> dict[str, Any]:
-    """Makes the table; adds what the critics thought, to critic.json and as critic-scores.png.
+    """Makes the table, with what the critics thought in critic.json and as critic-scores.png.
 
     Returns:
         What critic.json holds; "opinion" has for each training the mean scores of predictions and of real shapes in ten
         equal parts of its steps.
     """
-    result = make(CRITIC, bench)
-    runs = [bench.train(bench.config(with_critic, seed=seed)) for seed in range(bench.seeds)]
-    result["opinion"] = [_opinion(run) for run in runs]
-    write_text(bench.out / "critic.json", json.dumps(result, indent=2) + "\n")
-    figures.save(_figure(runs), bench.out / "critic-scores.png")
+    configs = bench.configs(with_critic)
+    result = tabulate(CRITIC, bench)
+    bench.train_all([c for c in configs if bench.needs_training(lambda asked, c=c: _opinion(asked, c))])
+    opinions = [_opinion(bench, config) for config in configs]
+    result["opinion"] = [_in_parts(opinion) for opinion in opinions]
+    bench.publish("critic", result, markdown(result), figure(result))
+    figures.save(_scores_figure(opinions), bench.out / "critic-scores.png")
     return result
 
 
-def _judged(run: Path) -> dict[str, np.ndarray]:
-    records = [record for record in read_metrics(run) if "fake_score" in record]
-    return {
-        name: np.array([record[name] for record in records])
-        for name in ("step", "fake_score", "real_score", "stage")
-    }
+def _opinion(bench: Workbench, config: FitConfig) -> Scores:
+    """A critic at every logged step, (K,): "step", "stage", its mean scores of predictions and of real shapes."""
+
+    def take() -> Scores:
+        records = [record for record in read_metrics(bench.train(config)) if "fake_score" in record]
+        names = ("step", "stage", "fake_score", "real_score")
+        return {name: torch.tensor([record[name] for record in records]).double() for name in names}
+
+    return bench.kept(["the critic's opinion", bench.run_of(config).name], take)
 
 
-def _opinion(run: Path) -> dict[str, list[float]]:
-    judged = _judged(run)
+def _in_parts(opinion: Scores) -> dict[str, list[float]]:
     return {
-        name: [float(part.mean()) for part in np.array_split(judged[f"{name}_score"], _PARTS) if part.size]
+        name: [part.mean().item() for part in opinion[f"{name}_score"].tensor_split(_PARTS) if len(part)]
         for name in ("fake", "real")
     }
 
 
-def _figure(runs: list[Path]) -> Figure:
+def _scores_figure(opinions: Sequence[Scores]) -> Figure:
     """Left: scores of predictions and of real shapes; right: how far predictions are behind. A line a training."""
-    figure = Figure(figsize=(12, 4.4), layout="constrained", dpi=110)
-    left, right = figure.subplots(1, 2)
-    for number, run in enumerate(runs):
-        judged = _judged(run)
+    drawn = Figure(figsize=(12, 4.4), layout="constrained", dpi=110)
+    left, right = drawn.subplots(1, 2)
+    for number, opinion in enumerate(opinions):
+        judged = {name: values.numpy() for name, values in opinion.items()}
         smooth = {name: figures.running_mean(judged[name], share=25) for name in ("fake_score", "real_score")}
         for name, label, colour in (
             ("real_score", "real shapes", "#a4562a"),
@@ -75,5 +80,5 @@ def _figure(runs: list[Path]) -> Figure:
     )
     for axes in (left, right):
         figures.plain(axes)
-    figure.suptitle(f"{trainings(len(runs))}, running means", fontsize=11)
-    return figure
+    drawn.suptitle(f"{trainings(len(opinions))}, running means", fontsize=11)
+    return drawn

@@ -174,6 +174,13 @@ def make(table: Table, bench: Workbench) -> dict[str, Any]:
     Returns:
         What NAME.json holds.
     """
+    result = tabulate(table, bench)
+    bench.publish(table.name, result, markdown(result), figure(result))
+    return result
+
+
+def tabulate(table: Table, bench: Workbench) -> dict[str, Any]:
+    """Trains and measures what is missing; what NAME.json is to hold."""
     bench.train_all(table.missing(bench))
 
     def measured(row: Row) -> Scores:
@@ -198,7 +205,6 @@ def make(table: Table, bench: Workbench) -> dict[str, Any]:
     }
     if table.category_claims:
         result["categories"] = _categories(table, scores, kinds)
-    bench.publish(table.name, result, markdown(result), _figure(result))
     return result
 
 
@@ -385,11 +391,11 @@ def table_lines(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]
     return [table_row(cells) for cells in (head, ruler, *rows)]
 
 
-def _figure(result: Mapping[str, Any]) -> Figure:
+def figure(result: Mapping[str, Any]) -> Figure:
     """A panel for each column: a dot for each training, a bar for their mean."""
     rows, columns = list(result["rows"]), result["columns"]
-    figure = Figure(figsize=(3.2 * len(columns) + 2, 0.42 * len(rows) + 1.4), layout="constrained", dpi=110)
-    panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
+    drawn = Figure(figsize=(3.2 * len(columns) + 2, 0.42 * len(rows) + 1.4), layout="constrained", dpi=110)
+    panels = drawn.subplots(1, len(columns), sharey=True, squeeze=False)[0]
     for axes, column in zip(panels, columns, strict=True):
         for height, name in enumerate(rows):
             values = result["rows"][name]["by_seed"].get(column)
@@ -403,5 +409,5 @@ def _figure(result: Mapping[str, Any]) -> Figure:
     panels[0].set_yticks(range(len(rows)), rows)
     panels[0].invert_yaxis()
     of = f"{result['shapes']} shapes, {trainings(result['seeds'])} of each"
-    figure.suptitle(f"{result['title']} {of}", fontsize=11)
-    return figure
+    drawn.suptitle(f"{result['title']} {of}", fontsize=11)
+    return drawn
