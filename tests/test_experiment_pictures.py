@@ -33,6 +33,7 @@ from train.experiments.one_armed.chairs import (
     without,
 )
 from train.experiments.one_armed.measure import configs, one_armed, presence
+from train.experiments.page import write_page
 from train.experiments.photos import photos, read_objects
 from train.experiments.reconstructions import picked, reconstructions
 from train.experiments.workbench import Workbench
@@ -211,6 +212,8 @@ def test_photographs_are_reconstructed(bench: Workbench, pictures: Path) -> None
         in page
     )
     assert "not an image" in result["left_out"]["broken/broken.jpg"] and "broken/broken.jpg" in page
+    again = write_page(bench.out).read_text()
+    assert f"--seeds {bench.seeds} --pictures {pictures.name}`" in again
 
 
 def test_too_many_photographs_are_named(

@@ -74,9 +74,10 @@ def _section(folder: Path, name: str, result: Mapping[str, Any], beside: Path) -
         parts.append(f"![{picture.stem}]({picture.relative_to(beside).as_posix()})")
     if "profile" in result:
         data = " ".join(Path(root).name for root in result.get("data", ()))
+        pictures = f" --pictures {Path(result['pictures']).name}" if "pictures" in result else ""
         parts.append(
             f"`python -m train experiment {name} --data {data} --out OUT --profile {result['profile']} "
-            f"--seeds {result['seeds']}`"
+            f"--seeds {result['seeds']}{pictures}`"
         )
     return "\n\n".join(parts)
 

@@ -183,19 +183,21 @@ def _markdown(result: Mapping[str, Any]) -> str:
 
 def _figure(result: Mapping[str, Any], objects: Sequence[_Object], answers: Sequence[Scores]) -> Figure:
     """A row for each object. Nothing says where its cameras stood: clouds are seen from the network's own front."""
-    figure, panels = figures.grid(rows=len(objects), columns=_SHOWN_PICTURES + CODES + 2)
+    several = max(len(found.pictures) for found in objects)
+    shown = min(several, _SHOWN_PICTURES)
+    figure, panels = figures.grid(rows=len(objects), columns=shown + CODES + 2)
     front = orbit_camera(np.array([30.0]), np.array([20.0]), 128).to(dtype=torch.float32)
     for line, found, made in zip(panels, objects, answers, strict=True):
-        for axes in line[:_SHOWN_PICTURES]:
+        for axes in line[:shown]:
             figures.bare(axes)
-        for axes, picture in zip(line, found.pictures[:_SHOWN_PICTURES], strict=False):
+        for axes, picture in zip(line, found.pictures[:shown], strict=False):
             figures.draw_image(axes, picture)
         figures.caption(
             line[0], f"{found.name}, {len(found.pictures)} picture{'s' if len(found.pictures) > 1 else ''}"
         )
         everything = torch.cat([made["agreed"], made["one"].flatten(0, 1)])
         close = figures.narrowed(front, everything)
-        for axes, cloud in zip(line[_SHOWN_PICTURES:-2], made["one"], strict=True):
+        for axes, cloud in zip(line[shown:-2], made["one"], strict=True):
             figures.draw_cloud(axes, cloud, close[0])
         for axes, camera in zip(line[-2:], (close[0], figures.from_behind(close[0])), strict=True):
             figures.draw_cloud(axes, made["agreed"], camera)
@@ -203,12 +205,11 @@ def _figure(result: Mapping[str, Any], objects: Sequence[_Object], answers: Sequ
         if len(found.pictures) > 1:
             figures.caption(line[-2], f"disagreement {before:.2f} to {after:.2f}")
     codes = [f"from the first, code {number + 1}" for number in range(CODES)]
-    figures.titles(
-        panels, ["pictures", *[""] * (_SHOWN_PICTURES - 1), *codes, "from all pictures", "from behind"]
-    )
-    figures.headline(
-        figure,
-        f"Photographs, profile {result['profile']}, seed 0; disagreement of the pictures' predictions (chamfer x100) "
-        "with random codes, and after search and descent",
-    )
+    figures.titles(panels, ["pictures", *[""] * (shown - 1), *codes, "from all pictures", "from behind"])
+    title = f"Photographs, profile {result['profile']}, seed 0"
+    if several > 1:
+        title += (
+            "; how far the pictures' predictions disagree (chamfer x100), with random and with agreed codes"
+        )
+    figures.headline(figure, title)
     return figure
