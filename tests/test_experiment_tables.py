@@ -146,6 +146,19 @@ def test_trainings_share_their_first_stage(bench: Workbench) -> None:
         assert parts_of(whole) == (whole,)
 
 
+def test_one_category_takes_half_the_steps_of_all_at_cpu(bench: Workbench) -> None:
+    table = TABLES["single-category"]
+    ours, psgn = (next(row for row in table.rows if row.name == name) for name in ("ours", "PSGN"))
+    for profile, share in (("cpu", 0.5), ("full", 1.0)):
+        usual = dataclasses.replace(bench, profile=profile, steps=None)
+        for row in (ours, psgn):
+            config, of_all = table.config(row, usual, seed=0), usual.config(row.change, seed=0)
+            assert config.categories == (bench.category,)
+            assert config.stage1.steps == share * of_all.stage1.steps
+            assert config.stage2.steps == share * of_all.stage2.steps
+    assert table.config(ours, bench, seed=0).stage1.steps == bench.steps
+
+
 def test_tables_share_what_is_trained(bench: Workbench) -> None:
     runs = set((bench.out / "runs").iterdir())
     wanted = {bench.run_of(part) for config in DETERMINISTIC.configs(bench) for part in parts_of(config)}
