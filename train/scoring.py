@@ -126,12 +126,17 @@ def answers(model: Generator, test: LoadedSplit, *, codes: int, seed: int) -> It
     Yields:
         B shapes with the one view that is shown, and (R, B, N, 3) predictions in the world frame.
     """
-    first = view_order(test, seed)[:, :1]
     generator = torch.Generator().manual_seed(seed)
-    for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
-        shown = test.batch(shapes, first[shapes])
+    for shapes, shown in one_view_each(test, seed):
         drawn = torch.randn(codes, len(shapes), model.code_dim, generator=generator)
         yield shown, model(shown.images[:, 0], drawn).contiguous()
+
+
+def one_view_each(test: LoadedSplit, seed: int) -> Iterator[tuple[Tensor, Batch]]:
+    """Every shape with the first view of a seed's order, some at a time: (B,) shape numbers, and their batch."""
+    first = view_order(test, seed)[:, :1]
+    for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
+        yield shapes, test.batch(shapes, first[shapes])
 
 
 def distance_between(answers: Tensor) -> Tensor:

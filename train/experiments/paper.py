@@ -15,15 +15,7 @@ from train.experiments.table import Claim, Row, Table, below
 from train.experiments.workbench import Change, Workbench, as_it_is
 from train.metrics import visible_error
 from train.recipes import with_system
-from train.scoring import (
-    SHAPES_AT_ONCE,
-    Scores,
-    answers,
-    distance_between,
-    distance_to_nearest,
-    joined,
-    view_order,
-)
+from train.scoring import Scores, answers, distance_between, distance_to_nearest, joined, one_view_each
 from train.systems import cloud_size
 
 
@@ -119,15 +111,11 @@ def _spread_of_samples(row: Row, bench: Workbench, config: FitConfig) -> Scores:
     def take() -> Scores:
         order = torch.randperm(available, generator=torch.Generator().manual_seed(config.seed))
         samples = [part for part in order.split(size) if len(part) == size]
-        real, first = train.points[some, :points], view_order(test, config.seed)[:, :1]
+        real = train.points[some, :points]
         return joined(
             [
-                _spread(
-                    torch.stack([test.points[shapes][:, sample] for sample in samples]),
-                    test.batch(shapes, first[shapes]),
-                    real,
-                )
-                for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE)
+                _spread(torch.stack([test.points[shapes][:, sample] for sample in samples]), shown, real)
+                for shapes, shown in one_view_each(test, config.seed)
             ]
         )
 

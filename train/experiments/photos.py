@@ -183,8 +183,8 @@ def _markdown(result: Mapping[str, Any]) -> str:
 
 def _figure(result: Mapping[str, Any], objects: Sequence[_Object], answers: Sequence[Scores]) -> Figure:
     """A row for each object. Nothing says where its cameras stood: clouds are seen from the network's own front."""
-    several = max(len(found.pictures) for found in objects)
-    shown = min(several, _SHOWN_PICTURES)
+    most = max(len(found.pictures) for found in objects)
+    shown = min(most, _SHOWN_PICTURES)
     figure, panels = figures.grid(rows=len(objects), columns=shown + CODES + 2)
     front = orbit_camera(np.array([30.0]), np.array([20.0]), 128).to(dtype=torch.float32)
     for line, found, made in zip(panels, objects, answers, strict=True):
@@ -207,7 +207,7 @@ def _figure(result: Mapping[str, Any], objects: Sequence[_Object], answers: Sequ
     codes = [f"from the first, code {number + 1}" for number in range(CODES)]
     figures.titles(panels, ["pictures", *[""] * (shown - 1), *codes, "from all pictures", "from behind"])
     title = f"Photographs, profile {result['profile']}, seed 0"
-    if several > 1:
+    if most > 1:
         title += (
             "; how far the pictures' predictions disagree (chamfer x100), with random and with agreed codes"
         )

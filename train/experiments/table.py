@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from train import figures
-from train.config import FitConfig, InferenceConfig, Profile, scaled
+from train.config import FitConfig, InferenceConfig, scaled
 from train.experiments.workbench import Change, Workbench, as_it_is, stage1_of
 from train.scoring import Scores, stacked
 
@@ -35,7 +35,7 @@ NAMES = {
 }
 # The paper trains stage 1 for 40 000 steps on one category and for 100 000 on thirteen. The full profile's lengths are
 # those for one, the cpu profile's are for all the families together.
-_STEPS_FOR_ONE_CATEGORY: dict[Profile, float] = {"cpu": 0.5}
+_CPU_STEPS_FOR_ONE_CATEGORY = 0.5
 _RESAMPLES = 4000
 _SURE = 0.9
 
@@ -145,10 +145,10 @@ class Table:
         config = bench.config(row.change, seed=seed)
         if not self.of_one_category:
             return config
-        one = dataclasses.replace(config, categories=(bench.category,))
-        return (
-            one if bench.steps is not None else scaled(one, _STEPS_FOR_ONE_CATEGORY.get(bench.profile, 1.0))
-        )
+        config = dataclasses.replace(config, categories=(bench.category,))
+        if bench.profile == "cpu" and bench.steps is None:
+            return scaled(config, _CPU_STEPS_FOR_ONE_CATEGORY)
+        return config
 
     def configs(self, bench: Workbench) -> list[FitConfig]:
         """Every training that the table rests on, no longer than it needs it, seed by seed."""

@@ -31,7 +31,7 @@ from train.experiments.side_by_side import run_side_by_side
 from train.files import replacing, write_text
 from train.fit import fit
 from train.runs import read_split
-from train.scoring import Scores, compare, score
+from train.scoring import SHAPES_AT_ONCE, Scores, compare, joined, score
 from train.systems import build_network, cloud_size, image_size
 from train.trivial import medoid, nearest_by_image
 
@@ -280,9 +280,9 @@ class Workbench:
                 clouds = train.points[medoid(train.points)].expand_as(test.points)
             else:
                 clouds = train.points[nearest_by_image(test, train, views=(views,))[views]]
-            parts = zip(clouds.split(16), test.points.split(16), strict=True)
-            found = [compare(cloud.contiguous(), truth, points=points) for cloud, truth in parts]
-            return {name: torch.cat([part[name] for part in found]).double() for name in found[0]}
+            parts = zip(clouds.split(SHAPES_AT_ONCE), test.points.split(SHAPES_AT_ONCE), strict=True)
+            found = joined([compare(cloud.contiguous(), truth, points=points) for cloud, truth in parts])
+            return {name: values.double() for name, values in found.items()}
 
         key = [answer, points, image_size(config), views, train.fingerprint, test.fingerprint]
         return self.kept(key, take)

@@ -18,7 +18,7 @@ from train.experiments.workbench import Workbench
 from train.fit import STAGES
 from train.log import read_metrics
 from train.metrics import cloud_errors, in_silhouette, visible_error
-from train.scoring import SHAPES_AT_ONCE, Scores, view_order
+from train.scoring import SHAPES_AT_ONCE, Scores, joined, view_order
 from train.systems import size_of
 from train.validation import validate
 
@@ -140,7 +140,7 @@ def beside_the_truth(clouds: Tensor, test: LoadedSplit, first: Tensor) -> Scores
                 **densities(made, truth, visible_points(truth, seen.camera, method="horizon")[:, 0]),
             }
         )
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    return joined(parts)
 
 
 def densities(clouds: Tensor, truth: Tensor, seen: Tensor) -> Scores:
