@@ -28,7 +28,7 @@ from models.baselines import (
     build_ptn,
     build_r2n2,
 )
-from train import lessons
+from train import ideals, lessons
 from train.config import FitConfig, System
 from train.errors import UserError
 from train.laps import Laps
@@ -45,16 +45,18 @@ class Method:
         sizes: profile -> the network's configuration.
         lessons: phase -> loss.
         kind: the network's own class, if no other method has it.
+        ideal: its answer if it had learnt without an error, where that can be said.
     """
 
     build: Callable[[str], Predictor]
     sizes: Mapping[str, GeneratorConfig | BaselineConfig]
     lessons: Mapping[str, lessons.Lesson]
     kind: type[Baseline] | None = None
+    ideal: ideals.Ideal | None = None
 
 
 METHODS: dict[System, Method] = {
-    "psgn": Method(build_psgn, SIZES, {"stage1": lessons.whole_clouds}),
+    "psgn": Method(build_psgn, SIZES, {"stage1": lessons.whole_clouds}, ideal=ideals.sampled_surface),
     "psgn-mon": Method(build_generator, SIZES, {"stage1": lessons.best_whole_cloud}),
     "front-mon": Method(build_generator, SIZES, {"stage1": lessons.best_front}),
     "lin": Method(
@@ -62,14 +64,18 @@ METHODS: dict[System, Method] = {
         LIN_PROFILES,
         {"stage1": lessons.fixed_views, "stage2": lessons.projections},
         StructureGenerator,
+        ideals.fused_maps,
     ),
     "r2n2": Method(
         build_r2n2,
         R2N2_PROFILES,
         {"stage1": lessons.filled_cells, "stage2": lessons.filled_cells},
         RecurrentReconstruction,
+        ideals.true_cells,
     ),
-    "ptn": Method(build_ptn, PTN_PROFILES, {"stage1": lessons.outlines}, SilhouetteReconstruction),
+    "ptn": Method(
+        build_ptn, PTN_PROFILES, {"stage1": lessons.outlines}, SilhouetteReconstruction, ideals.hull
+    ),
 }
 
 

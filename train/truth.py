@@ -32,13 +32,8 @@ def solid_cells(truth: Truth, size: int) -> Tensor:
         >>> cells[0, :, 4, 4].int().tolist()
         [0, 0, 1, 1, 1, 1, 0, 0]
     """
-    batch, _, height, width = truth.depth.shape
     centres = cell_centres(size).to(truth.points)
-    pixels, depth = project(centres.expand(batch, -1, -1), truth.camera)
-    x, y = pixels.floor().long().unbind(-1)
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (depth > 0)
-    place = torch.where(inside, y * width + x, 0)
-    surface = truth.depth.flatten(2).gather(2, place)
+    inside, depth, surface = _seen_at(centres, truth)
     lowest, highest = truth.points.amin(1, keepdim=True), truth.points.amax(1, keepdim=True)
     in_box = ((centres >= lowest) & (centres <= highest)).all(-1)
     filled = in_box & ~(inside & (depth < surface)).any(1)
@@ -46,8 +41,40 @@ def solid_cells(truth: Truth, size: int) -> Tensor:
     held = ((cell >= 0) & (cell < size)).all(-1)
     x, y, z = cell.unbind(-1)
     number = torch.where(held, (x * size + y) * size + z, size**3)  # beyond the grid: a cell that is cut off
-    holds_point = torch.zeros(batch, size**3 + 1, dtype=torch.bool).scatter_(1, number, True)[:, :-1]
+    holds_point = torch.zeros(len(number), size**3 + 1, dtype=torch.bool).scatter_(1, number, True)[:, :-1]
     return (filled | holds_point).unflatten(1, (size, size, size))
+
+
+def hull_cells(truth: Truth, size: int) -> Tensor:
+    """Which cells of the cube [-0.5, 0.5]^3 no silhouette rules out: (B, G, G, G) bool, along x, y and z.
+
+    A cell is left out when some view has an empty pixel where its centre is. This is the most that silhouettes say:
+    hollows that no outline shows are filled.
+
+    Args:
+        truth: the shapes.
+        size: G.
+
+    Example:
+        >>> camera = PinholeCamera.look_at(torch.tensor([[[0.0, 0, -9]]]), focal_px=288.0, height=32, width=32)
+        >>> depth = torch.full((1, 1, 32, 32), torch.inf)
+        >>> depth[..., 8:24] = 9.0  # a wall: nothing is known of how thick it is
+        >>> hull_cells(Truth(torch.zeros(1, 1, 3), depth, camera), 8)[0, :, 4].int().tolist()[1:3]
+        [[0, 0, 0, 0, 0, 0, 0, 0], [1, 1, 1, 1, 1, 1, 1, 1]]
+    """
+    inside, _, surface = _seen_at(cell_centres(size).to(truth.points), truth)
+    return (surface.isfinite() | ~inside).all(1).unflatten(1, (size, size, size))
+
+
+def _seen_at(centres: Tensor, truth: Truth) -> tuple[Tensor, Tensor, Tensor]:
+    """(C, 3) places in the world -> (B, V, C) of each view: is a place in its picture, how deep is it, and the depth
+    of what the picture shows there."""
+    _, _, height, width = truth.depth.shape
+    pixels, depth = project(centres.expand(len(truth.points), -1, -1), truth.camera)
+    x, y = pixels.floor().long().unbind(-1)
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (depth > 0)
+    surface = truth.depth.flatten(2).gather(2, torch.where(inside, y * width + x, 0))
+    return inside, depth, surface
 
 
 def fixed_depth(points: Tensor, size: int) -> Tensor:

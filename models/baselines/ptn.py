@@ -105,6 +105,11 @@ class SilhouetteReconstruction(Baseline):
         inside = cell_centres(_GRID_SIZE).norm(dim=1) <= _OBJECT_RADIUS
         self.register_buffer("inside", inside.float().unflatten(0, (_GRID_SIZE,) * 3), persistent=False)
 
+    @property
+    def grid_size(self) -> int:
+        """Cells along a side of the occupancy grid."""
+        return _GRID_SIZE
+
     def occupancy(self, images: Tensor) -> Tensor:
         """(B, 3, H, W) in [0, 1] -> (B, 32, 32, 32) in [0, 1], with gradient."""
         return self.inside * self.decoder(self.encoder(self._prepare(images)))[:, 0].sigmoid()

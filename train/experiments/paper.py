@@ -15,8 +15,17 @@ from train.experiments.table import Claim, Row, Table, below
 from train.experiments.workbench import Change, Workbench, as_it_is
 from train.metrics import visible_error
 from train.recipes import with_system
-from train.scoring import Scores, answers, distance_between, distance_to_nearest, joined, one_view_each
-from train.systems import cloud_size
+from train.scoring import (
+    SHAPES_AT_ONCE,
+    Scores,
+    answers,
+    compare,
+    distance_between,
+    distance_to_nearest,
+    joined,
+    one_view_each,
+)
+from train.systems import METHODS, cloud_size
 
 
 def deterministic(config: FitConfig) -> FitConfig:
@@ -173,6 +182,29 @@ _PSGN = {"gt_to_pred": 2.06, "pred_to_gt": 2.27, "cd": 4.34, "fps_cd": 4.34, "fp
 _PTN = {"gt_to_pred": 1.86, "pred_to_gt": 2.60, "cd": 4.46}
 _R2N2 = {"gt_to_pred": 2.47, "pred_to_gt": 3.21, "cd": 5.68}
 
+
+def _perfectly_taught(row: Row, bench: Workbench, config: FitConfig) -> Scores:
+    """What a method's kind of answer can be at best: its grid, its maps or its number of points, without an error."""
+    ideal = METHODS[config.system].ideal
+    assert ideal is not None
+
+    def measure(network: Predictor, test: LoadedSplit) -> Scores:
+        parts = []
+        for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
+            clouds = ideal(network, test.truth(shapes))
+            parts.append(compare(clouds, test.points[shapes], points=network.points))
+        return joined(parts)
+
+    return bench.measured(config, ["perfectly taught"], measure, stage=0)
+
+
+_OTHERS: tuple[tuple[str, System, int], ...] = (
+    ("PSGN", "psgn", 8),
+    ("Lin et al.", "lin", 8),
+    ("PTN", "ptn", 8),
+    ("3D-R2N2", "r2n2", 5),
+)
+
 SINGLE_CATEGORY = Table(
     name="single-category",
     title="Which method reconstructs shapes of one category best from eight views?",
@@ -180,6 +212,7 @@ SINGLE_CATEGORY = Table(
     columns=("gt_to_pred", "pred_to_gt", "cd", "fps_cd", "fps_pred_to_gt", "best_cd"),
     rows=(
         Row(name="3D-R2N2", change=of_system("r2n2"), views=5, paper=_R2N2),
+        Row(name="3D-R2N2, one image", change=of_system("r2n2"), views=1),
         Row(name="PTN", change=of_system("ptn"), paper=_PTN),
         Row(name="PSGN", change=of_system("psgn"), paper=_PSGN),
         Row(name="PSGN, views joined", change=of_system("psgn"), scored="joined"),
@@ -188,12 +221,23 @@ SINGLE_CATEGORY = Table(
         Row(name="ours, random codes", codes="random"),
         Row(name="nearest training shape by image", answer="nearest image"),
         Row(name="medoid of the training shapes", answer="medoid"),
+        # What is learnt by heart, and what could be: where an order comes from.
+        *(
+            Row(name=f"{name}, its training shapes", change=of_system(system), views=views, split="train")
+            for name, system, views in _OTHERS
+        ),
+        Row(name="ours, its training shapes, random codes", codes="random", split="train"),
+        *(
+            Row(name=f"{name}, perfectly taught", change=of_system(system), measure=_perfectly_taught)
+            for name, system, _ in _OTHERS
+        ),
     ),
     claims=(
         below("cd", "ours", "Lin et al."),
         below("cd", "Lin et al.", "PSGN"),
         below("cd", "PSGN", "PTN"),
         below("cd", "PTN", "3D-R2N2"),
+        below("cd", "PTN", "3D-R2N2, one image"),
         below("cd", "ours", "PSGN"),
         below("fps_cd", "ours", "PSGN"),
         below("fps_cd", "ours", "Lin et al."),

@@ -56,7 +56,7 @@ def reconstructions(row: Row, bench: Workbench, config: FitConfig) -> Scores:
         settings = InferenceConfig()
     if row.scored is not None:
         settings = dataclasses.replace(settings, scored=row.scored)
-    return bench.scores(config, settings, stage=row.stage, views=row.views)
+    return bench.scores(config, settings, stage=row.stage, views=row.views, split=row.split)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,6 +71,7 @@ class Row:
             "random".
         views: how many.
         scored: see `InferenceConfig`; the system's own way if None.
+        split: which shapes; a claim can compare rows of one split only.
         answer: "network", or what is answered instead; "truth" needs a `measure` of its own.
         measure: takes the figures.
         paper: the paper's figures.
@@ -82,6 +83,7 @@ class Row:
     codes: Literal["agreed", "agreed as in the paper", "searched", "random"] = "agreed"
     views: int = 8
     scored: Literal["joined", "each"] | None = None
+    split: Literal["train", "test"] = "test"
     answer: Literal["network", "medoid", "nearest image", "truth"] = "network"
     measure: Measure = reconstructions
     paper: Mapping[str, float] = dataclasses.field(default_factory=dict)

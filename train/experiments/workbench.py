@@ -209,7 +209,7 @@ class Workbench:
         *,
         stage: Literal[1, 2] = 2,
         views: int,
-        split: Literal["val", "test"] = "test",
+        split: Literal["train", "val", "test"] = "test",
         code_seed: int | None = None,
     ) -> Scores:
         """Figure -> (M,) of a configuration's network, trained if need be. Codes and views are drawn by its seed.
@@ -236,7 +236,7 @@ class Workbench:
         measure: Callable[[Predictor, LoadedSplit], Scores],
         *,
         stage: Literal[0, 1, 2] = 2,
-        split: Literal["val", "test"] = "test",
+        split: Literal["train", "val", "test"] = "test",
     ) -> Scores:
         """What a function finds of a configuration's network on a split, trained and measured if need be.
 
