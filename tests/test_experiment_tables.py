@@ -28,7 +28,7 @@ from train.experiments.paper import (
     with_critic,
     without_critic,
 )
-from train.experiments.table import Row, Table, below, confidence, make, markdown
+from train.experiments.table import Row, Table, below, confidence, make, markdown, measured
 from train.experiments.workbench import parts_of, stage1_of
 from train.log import read_metrics
 
@@ -182,9 +182,12 @@ def test_scores_outlive_their_runs(bench: Workbench, tmp_path: Path) -> None:
         path.unlink()
     seeds = [config.seed for config in table.missing(elsewhere)]
     assert seeds == [config.seed for config in table.configs(elsewhere)]
-    config = bench.config(deterministic, seed=0)
-    assert elsewhere.needs_training(lambda asked: asked.scores(config, config.inference, views=2))
-    assert not bench.needs_training(lambda asked: asked.scores(config, config.inference, views=2))
+    row = table.rows[0]
+    config = table.config(row, bench, seed=0)
+    assert not elsewhere.has(lambda asked: row.measure(row, asked, config))
+    assert bench.has(lambda asked: row.measure(row, asked, config))
+    other = dataclasses.replace(row, codes="agreed as in the paper")
+    assert not bench.has(lambda asked: other.measure(other, asked, config))
 
 
 def test_a_new_field_of_the_configuration_renames_no_run(bench: Workbench) -> None:
@@ -286,7 +289,7 @@ def test_the_critic_s_opinion_is_that_of_the_log(bench: Workbench, tmp_path: Pat
     assert (bench.out / "critic-scores.png").stat().st_size > 10_000
 
     shutil.move(run, tmp_path / run.name)
-    assert run_experiment("critic", dataclasses.replace(bench, trains=False)) == result, (
+    assert run_experiment("critic", dataclasses.replace(bench, measures=False)) == result, (
         "opinions outlive runs"
     )
 
@@ -300,6 +303,26 @@ def test_wrong_requests_are_named(bench: Workbench, tmp_path: Path) -> None:
         dataclasses.replace(bench, limit=1)
     with pytest.raises(UserError, match="no data at"):
         dataclasses.replace(bench, data=(tmp_path,)).run_of(bench.config(deterministic, seed=0))
+
+
+@pytest.mark.slow
+def test_measurements_side_by_side_are_those_of_one_process(bench: Workbench, tmp_path: Path) -> None:
+    table = TABLES["deterministic"]
+    calls = [
+        (row, table.config(row, bench, seed=0))
+        for row in table.rows
+        if row.name in ("deterministic", "conditional")
+    ]
+    bench.train_all([config for _, config in calls])
+    (tmp_path / "runs").symlink_to(bench.out / "runs")
+    beside = dataclasses.replace(bench, out=tmp_path, processes=2, _loaded={})
+    assert not any(beside.has(lambda asked, row=row, c=c: row.measure(row, asked, c)) for row, c in calls)
+    beside.measure_all(measured, [*calls, calls[0]])  # what is asked for twice is measured once
+    assert len(list((tmp_path / "scores").iterdir())) == 2
+    kept = dataclasses.replace(beside, measures=False)
+    for row, config in calls:
+        scores = row.measure(row, bench, config)
+        assert all(scores[name].equal(values) for name, values in row.measure(row, kept, config).items())
 
 
 @pytest.mark.slow

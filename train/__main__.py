@@ -192,7 +192,7 @@ class Experiment:
     steps: int | None = None
     """The same number of steps for every phase, for a quick look."""
     processes: int | None = None
-    """Trainings at once, with one core each; as many as there are cores if not given."""
+    """Trainings or measurements at once, with one core each; as many as there are cores if not given."""
     category: str = "chair"
     """What single-category is about."""
     pictures: Path | None = None

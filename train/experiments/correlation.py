@@ -44,14 +44,11 @@ def correlation(bench: Workbench) -> dict[str, Any]:
     config = bench.config(as_it_is, seed=0)
     bench.train_all(bench.configs(as_it_is))
     views = min(VIEWS, bench.split(config, "test").views)
-    agreed, groups = [], []
-    for seed in range(bench.seeds):
-        config = bench.config(as_it_is, seed=seed)
-        agreed.append(bench.scores(config, config.inference, views=views))
-        random = InferenceConfig(groups=1, steps=0)
-        groups.append(
-            stacked([bench.scores(config, random, views=views, code_seed=1 + g) for g in range(GROUPS)])
-        )
+    seeds = range(bench.seeds)
+    bench.measure_all(_agreed, [(seed, views) for seed in seeds])
+    bench.measure_all(_of_group, [(seed, views, group) for seed in seeds for group in range(GROUPS)])
+    agreed = [_agreed(bench, seed, views) for seed in seeds]
+    groups = [stacked([_of_group(bench, seed, views, group) for group in range(GROUPS)]) for seed in seeds]
     result = bench.about(bench.config(as_it_is, seed=0)) | {
         "shapes": agreed[0]["cd"].shape[0],
         "views": views,
@@ -67,6 +64,16 @@ def correlation(bench: Workbench) -> dict[str, Any]:
     result["claims"] = _claims(result)
     bench.publish("correlation", result, _markdown(result), _figure(result, agreed[0], groups[0]))
     return result
+
+
+def _agreed(bench: Workbench, seed: int, views: int) -> Scores:
+    config = bench.config(as_it_is, seed=seed)
+    return bench.scores(config, config.inference, views=views)
+
+
+def _of_group(bench: Workbench, seed: int, views: int, group: int) -> Scores:
+    random = InferenceConfig(groups=1, steps=0)
+    return bench.scores(bench.config(as_it_is, seed=seed), random, views=views, code_seed=1 + group)
 
 
 def _claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -29,7 +29,7 @@ def critic(bench: Workbench) -> dict[str, Any]:
     """
     configs = bench.configs(with_critic)
     result = tabulate(CRITIC, bench)
-    bench.train_all([c for c in configs if bench.needs_training(lambda asked, c=c: _opinion(asked, c))])
+    bench.train_all([c for c in configs if not bench.has(lambda asked, c=c: _opinion(asked, c))])
     opinions = [_opinion(bench, config) for config in configs]
     result["opinion"] = [_in_parts(opinion) for opinion in opinions]
     bench.publish("critic", result, markdown(result), figure(result))

@@ -26,6 +26,7 @@ from train.batches import LoadedSplit
 from train.config import PROFILES, FitConfig, StageConfig
 from train.errors import UserError
 from train.experiments.paper import without_critic
+from train.experiments.side_by_side import run_side_by_side
 from train.experiments.workbench import Workbench
 from train.files import kept, write_text
 from train.health import sensitivity
@@ -92,16 +93,17 @@ def health(bench: Workbench) -> dict[str, Any]:
     """
     steps = bench.steps or STEPS
     curves: dict[str, dict[str, list[list[dict[str, float]]]]] = {}
-    todo = len(bench.data) * len(VARIANTS) * bench.seeds
-    with tqdm(total=todo, unit="training", disable=not bench.progress) as bar:
-        for root in bench.data:
-            splits: list[LoadedSplit] = []
-            for name, variant in VARIANTS.items():
-                bar.set_description(f"{root.name}, {name}")
-                for seed in range(bench.seeds):
-                    found = _curve(bench, root, name, variant, seed=seed, steps=steps, splits=splits)
-                    curves.setdefault(root.name, {}).setdefault(name, []).append(found)
-                    bar.update()
+    trainings = [
+        (root, name, seed, steps) for root in bench.data for name in VARIANTS for seed in range(bench.seeds)
+    ]
+    missing = [training for training in trainings if not _kept_at(bench, *training).exists()]
+    if bench.processes > 1 and len(missing) > 1:
+        calls = [(bench.in_a_process(), *training) for training in missing]
+        processes = min(bench.processes, len(missing))
+        run_side_by_side(_curve, calls, processes=processes, title="trainings", progress=bench.progress)
+    for training in tqdm(trainings, desc="trainings", unit="training", disable=not bench.progress):
+        root, name, _, _ = training
+        curves.setdefault(root.name, {}).setdefault(name, []).append(_curve(bench, *training))
     result = {
         "profile": bench.profile, "data": [str(root) for root in bench.data], "seeds": bench.seeds, "steps": steps,
         "trees": {tree: {name: _summary(runs) for name, runs in rows.items()} for tree, rows in curves.items()},
@@ -113,32 +115,22 @@ def health(bench: Workbench) -> dict[str, Any]:
     return result
 
 
-def _curve(
-    bench: Workbench,
-    root: Path,
-    name: str,
-    variant: Variant,
-    *,
-    seed: int,
-    steps: int,
-    splits: list[LoadedSplit],
-) -> list[dict[str, float]]:
-    """The measurements of one training, taken now or read; `splits` holds the tree once it has been needed."""
-    base = bench.config(without_critic, seed=seed)
+def _curve(bench: Workbench, root: Path, name: str, seed: int, steps: int) -> list[dict[str, float]]:
+    """The measurements of one training, taken now or read."""
+    variant, base = VARIANTS[name], bench.config(without_critic, seed=seed)
     stage = base.stage1.lasting(steps)
     for change in variant.stage:
         stage = change(stage)
     config = dataclasses.replace(base, stage1=stage)
 
-    def train() -> list[dict[str, float]]:
-        if not splits:
-            splits.extend(_read(root, config))
-        return _train(config, variant, *splits)
-
     # The name is for people; what the measurements belong to is the configuration and the tree.
     key = [name, dataclasses.replace(bench, data=(root,)).run_of(config).name]
-    path = bench.out / "health" / f"{root.name}-{name.replace(' ', '-')}-{steps}-seed{seed}.json"
-    return kept(path, key, train)
+    path = _kept_at(bench, root, name, seed, steps)
+    return kept(path, key, lambda: _train(config, variant, *_read(root, config)))
+
+
+def _kept_at(bench: Workbench, root: Path, name: str, seed: int, steps: int) -> Path:
+    return bench.out / "health" / f"{root.name}-{name.replace(' ', '-')}-{steps}-seed{seed}.json"
 
 
 def _read(root: Path, config: FitConfig) -> tuple[LoadedSplit, LoadedSplit]:

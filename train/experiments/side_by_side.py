@@ -1,4 +1,4 @@
-"""Trainings side by side: networks this small use one core each better than all cores together."""
+"""Trainings and measurements side by side: networks this small use one core each better than all cores together."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def run_side_by_side(
 ) -> None:
     """Calls a function with each of several arguments, in processes with one thread each.
 
-    Ctrl-C and SIGTERM are passed on once to every process, whose training saves and ends; then KeyboardInterrupt is
+    Ctrl-C and SIGTERM are passed on once to every process, where a training saves and ends; then KeyboardInterrupt is
     raised. A call that fails lets those that are under way come to their end, and is raised then.
 
     Args:
         function: importable by name; it and its arguments are pickled.
         arguments: of every call.
         processes: at once.
-        title: of the bar.
+        title: of the bar: what is done, in the plural.
         progress: show it.
 
     Raises:
@@ -50,7 +50,7 @@ def run_side_by_side(
     with (
         StopRequest() as stop,
         ProcessPoolExecutor(processes, mp_context=context, initializer=_alone) as pool,
-        tqdm(total=len(arguments), desc=title, unit="training", disable=not progress) as bar,
+        tqdm(total=len(arguments), desc=title, unit=title.removesuffix("s"), disable=not progress) as bar,
     ):
         while running or (waiting and failed is None):
             # No more than run at once are handed over: what waits in the pool could not be taken back.
@@ -67,7 +67,8 @@ def run_side_by_side(
                 raise KeyboardInterrupt
     if isinstance(failed, BrokenProcessPool):
         raise UserError(
-            "a training was ended from outside (out of memory?); call again to continue, with fewer --processes"
+            f"one of the {title} was ended from outside (out of memory?); call again to continue, with fewer "
+            "--processes"
         ) from None
     if failed is not None:
         raise failed

@@ -72,7 +72,7 @@ class Row:
         views: how many.
         scored: see `InferenceConfig`; the system's own way if None.
         split: which shapes; a claim can compare rows of one split only.
-        answer: "network", or what is answered instead; "truth" needs a `measure` of its own.
+        answer: "network", or what is answered instead of a trained one; "truth" needs a `measure` of its own.
         measure: takes the figures.
         paper: the paper's figures.
     """
@@ -161,7 +161,7 @@ class Table:
 
         def needed(row: Row, seed: int) -> bool:
             config = self.config(row, bench, seed=seed)
-            return bench.needs_training(lambda asked: row.measure(row, asked, config))
+            return not bench.has(lambda asked: row.measure(row, asked, config))
 
         return [
             self._training(row, bench, seed)
@@ -192,12 +192,14 @@ def make(table: Table, bench: Workbench) -> dict[str, Any]:
 def tabulate(table: Table, bench: Workbench) -> dict[str, Any]:
     """Trains and measures what is missing; what NAME.json is to hold."""
     bench.train_all(table.missing(bench))
-
-    def measured(row: Row) -> Scores:
-        configs = [table.config(row, bench, seed=seed) for seed in range(bench.seeds)]
-        return stacked([row.measure(row, bench, config) for config in configs])
-
-    scores = {row.name: measured(row) for row in table.rows}
+    configs = {
+        row.name: [table.config(row, bench, seed=seed) for seed in range(bench.seeds)] for row in table.rows
+    }
+    bench.measure_all(measured, [(row, config) for row in table.rows for config in configs[row.name]])
+    scores = {
+        row.name: stacked([measured(bench, row, config) for config in configs[row.name]])
+        for row in table.rows
+    }
     config = table.config(table.rows[0], bench, seed=0)
     paper = {row.name: row.paper for row in table.rows}
     kinds = bench.split(config, "test").categories
@@ -216,6 +218,11 @@ def tabulate(table: Table, bench: Workbench) -> dict[str, Any]:
     if table.category_claims:
         result["categories"] = _categories(table, scores, kinds)
     return result
+
+
+def measured(bench: Workbench, row: Row, config: FitConfig) -> Scores:
+    """A row's figures for one training, taken now or kept."""
+    return row.measure(row, bench, config)
 
 
 def _figures(row: Row, scores: Scores, columns: Sequence[str]) -> dict[str, Any]:

@@ -49,8 +49,8 @@ _NO_PART_OF_A_KEY = (
 )
 
 
-class Untrained(Exception):
-    """A run that is not there, where nothing may be trained."""
+class Unmeasured(Exception):
+    """Scores that are not there, where nothing may be measured."""
 
 
 Change = Callable[[FitConfig], FitConfig]
@@ -69,10 +69,10 @@ class Workbench:
         limit: score at most that many test shapes.
         steps: if given, the same number of steps for every phase, for a quick look.
         progress: show bars.
-        processes: how many trainings at once, each in a process with one thread.
+        processes: how many trainings or measurements at once, each in a process with one thread.
         category: what experiments on shapes of one kind are about.
         pictures: a folder of photographs for each object, for the experiment that shows what is made of them.
-        trains: False: what would have to be trained is refused with `Untrained`.
+        measures: False: what would have to be measured is refused with `Unmeasured`.
     """
 
     data: tuple[Path, ...]
@@ -85,7 +85,7 @@ class Workbench:
     processes: int = 1
     category: str = "chair"
     pictures: Path | None = None
-    trains: bool = True
+    measures: bool = True
     _loaded: dict[tuple, LoadedSplit] = dataclasses.field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -145,8 +145,6 @@ class Workbench:
         run = self.run_of(config)
         if self.is_trained(config):
             return run
-        if not self.trains:
-            raise Untrained(run)
         if start is not None:
             stage1 = dataclasses.replace(config.stage1, steps=0)
             config = dataclasses.replace(config, stage1=stage1, start=str(start))
@@ -161,13 +159,13 @@ class Workbench:
         write_text(run / "trained.json", json.dumps({"seconds": seconds, "continued": begun}) + "\n")
         return run
 
-    def needs_training(self, measure: Callable[[Workbench], object]) -> bool:
-        """Would a measurement have to train, because neither its scores nor its network are kept?"""
+    def has(self, measure: Callable[[Workbench], object]) -> bool:
+        """Are the scores kept that a measurement would take? Then it needs no network."""
         try:
-            measure(dataclasses.replace(self, trains=False))
-        except Untrained:
-            return True
-        return False
+            measure(dataclasses.replace(self, measures=False))
+        except Unmeasured:
+            return False
+        return True
 
     def missing(self, configs: Sequence[FitConfig]) -> tuple[list[FitConfig], list[FitConfig]]:
         """The runs that trainings still need, each once: those that start afresh, and those that start from them."""
@@ -188,8 +186,7 @@ class Workbench:
         for missing in self.missing(configs):
             processes = min(self.processes, len(missing))
             if processes > 1:
-                quiet = dataclasses.replace(self, progress=False, processes=1, _loaded={})
-                calls = [(quiet, config) for config in missing]
+                calls = [(self.in_a_process(), config) for config in missing]
                 run_side_by_side(
                     _train, calls, processes=processes, title="trainings", progress=self.progress
                 )
@@ -201,6 +198,37 @@ class Workbench:
                     self.train(config)
             finally:
                 torch.set_num_threads(threads)
+
+    def measure_all(self, measure: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
+        """Takes measurements whose scores are not kept yet, `processes` at once; a lone process leaves them for later.
+
+        Args:
+            measure: called with a bench and each of the arguments; importable by name. What it returns is thrown away,
+                what it keeps on the bench stays.
+            arguments: can be pickled; nothing that they need is still to be trained.
+
+        Raises:
+            KeyboardInterrupt: a signal ended it early; what was measured is kept.
+        """
+        if self.processes == 1:
+            return
+        asked = dataclasses.replace(self, measures=False)
+        missing: dict[str, tuple[Any, ...]] = {}
+        for given in arguments:
+            try:
+                measure(asked, *given)
+            except Unmeasured as scores:
+                missing.setdefault(str(scores), given)
+        if len(missing) > 1:
+            calls = [(measure, self.in_a_process(), *given) for given in missing.values()]
+            processes = min(self.processes, len(missing))
+            run_side_by_side(
+                _measure, calls, processes=processes, title="measurements", progress=self.progress
+            )
+
+    def in_a_process(self) -> Workbench:
+        """The same for one of several processes: it is quiet, and starts no others."""
+        return dataclasses.replace(self, progress=False, processes=1, _loaded={})
 
     def scores(
         self,
@@ -307,6 +335,8 @@ class Workbench:
         """
         path = self.out / "scores" / f"{_digest(json.dumps(key, sort_keys=True))}.safetensors"
         if not path.exists():
+            if not self.measures:
+                raise Unmeasured(path)
             found = take()
             with replacing(path) as temporary:
                 temporary.write_bytes(save(found))
@@ -353,6 +383,10 @@ def parts_of(config: FitConfig) -> tuple[FitConfig, ...]:
 
 def _train(bench: Workbench, config: FitConfig) -> None:
     bench.train(config)
+
+
+def _measure(measure: Callable[..., object], bench: Workbench, *given: Any) -> None:
+    measure(bench, *given)
 
 
 def _digest(text: str) -> str:
