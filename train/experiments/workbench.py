@@ -38,6 +38,9 @@ from train.trivial import medoid, nearest_by_image
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# A method's error on the shapes that it was trained on needs no more of them.
+_SOME_TRAINING_SHAPES = 100
+
 # What does not change a run's weights, and so not its name.
 _NO_PART_OF_A_KEY = (
     "inference",
@@ -247,7 +250,7 @@ class Workbench:
             settings: how its codes are chosen.
             stage: whose best weights.
             views: per shape.
-            split: what is scored.
+            split: what is scored; of the training shapes a hundred, spread evenly.
             code_seed: draws the codes in place of the configuration's seed.
         """
 
@@ -273,9 +276,9 @@ class Workbench:
             what: names the measurement, with everything that decides its outcome; can be written as JSON.
             measure: makes it.
             stage: see `network`.
-            split: of the first tree.
+            split: of the first tree; of the training shapes a hundred, spread evenly.
         """
-        data = self.split(config, split)
+        data = self.split(config, split, limit=_SOME_TRAINING_SHAPES if split == "train" else None)
         run = self.run_of(stage1_of(config) if stage == 1 else config)
 
         def take() -> Scores:
@@ -315,12 +318,15 @@ class Workbench:
         key = [answer, points, image_size(config), views, train.fingerprint, test.fingerprint]
         return self.kept(key, take)
 
-    def split(self, config: FitConfig, split: Literal["train", "val", "test"]) -> LoadedSplit:
-        """A split of the first tree as a configuration reads it; read once."""
+    def split(
+        self, config: FitConfig, split: Literal["train", "val", "test"], *, limit: int | None = None
+    ) -> LoadedSplit:
+        """A split of the first tree as a configuration reads it; read once. All of it, but for the bench's own limit on
+        the shapes that are scored, or at most `limit` of its shapes."""
         size = image_size(config)
-        key = (self.data[:1], self.limit, split, *size, config.map_size, config.gt_pool, config.categories)
+        limit = limit or (self.limit if split != "train" else None)
+        key = (self.data[:1], limit, split, *size, config.map_size, config.gt_pool, config.categories)
         if key not in self._loaded:
-            limit = self.limit if split != "train" else None
             self._loaded[key] = read_split(
                 config, self.data[0], split, image_size=size, limit=limit, progress=self.progress
             )
