@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from models import Predictor
@@ -14,6 +13,7 @@ from models.baselines import (
     SilhouetteReconstruction,
     Structure,
     StructureGenerator,
+    pixel_centres,
     surface_points,
 )
 from train.batches import Truth
@@ -32,11 +32,8 @@ def fused_maps(network: StructureGenerator, truth: Truth) -> Tensor:
     """Lin et al.: the maps of the eight fixed cameras, put together."""
     size = network.config.map_size
     depth = fixed_depth(truth.points, size)
-    filled = depth.isfinite()
-    centres = torch.arange(size) + 0.5
-    pixels = torch.stack(torch.meshgrid(centres, centres, indexing="xy")).to(depth)
-    logits = filled.to(depth) - 0.5
-    return network.answer_of(Structure(pixels.expand(*depth.shape[:2], -1, -1, -1), depth, logits))
+    pixels = pixel_centres(size).expand(*depth.shape[:2], -1, -1, -1)
+    return network.answer_of(Structure(pixels, depth, logits=depth.isfinite().to(depth) - 0.5))
 
 
 def true_cells(network: RecurrentReconstruction, truth: Truth) -> Tensor:

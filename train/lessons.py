@@ -18,6 +18,7 @@ from models.baselines import (
     RecurrentReconstruction,
     SilhouetteReconstruction,
     StructureGenerator,
+    pixel_centres,
     silhouettes,
 )
 from train.batches import Batch, Truth
@@ -78,9 +79,7 @@ def fixed_views(network: StructureGenerator, given: Given) -> dict[str, Tensor]:
     structure = network.structure(given.batch.images.flatten(0, 1))
     true = _for_each_image(fixed_depth(given.truth.points, network.config.map_size), given)
     filled = true.isfinite()
-    centres = torch.arange(network.config.map_size) + 0.5
-    across = torch.stack(torch.meshgrid(centres, centres, indexing="xy"))
-    place = (structure.pixels - across).abs().sum()
+    place = (structure.pixels - pixel_centres(network.config.map_size)).abs().sum()
     depth = (structure.depth - true.where(filled, structure.depth.detach())).abs().sum()
     mask = F.binary_cross_entropy_with_logits(structure.logits, filled.float(), reduction="sum")
     terms = {"place": place, "depth": depth, "mask": mask}

@@ -10,6 +10,7 @@ from models.baselines.lin import (
     StructureGenerator,
     build_lin,
     fixed_cameras,
+    pixel_centres,
 )
 from models.baselines.psgn import build_psgn
 from models.baselines.ptn import PTN_PROFILES, PTNConfig, SilhouetteReconstruction, build_ptn, silhouettes
@@ -35,6 +36,7 @@ __all__ = [
     "build_r2n2",
     "cell_centres",
     "fixed_cameras",
+    "pixel_centres",
     "silhouettes",
     "surface_points",
 ]

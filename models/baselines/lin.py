@@ -164,6 +164,17 @@ def fixed_cameras(points: Tensor) -> Tensor:
     return points[:, None] @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
 
 
+def pixel_centres(size: int) -> Tensor:
+    """(2, S, S): where the pixels of a map are, x and y in pixels.
+
+    Example:
+        >>> pixel_centres(4)[:, 0, 3].tolist()
+        [3.5, 0.5]
+    """
+    centres = torch.arange(size) + 0.5
+    return torch.stack(torch.meshgrid(centres, centres, indexing="xy"))
+
+
 def _fixed_poses() -> Tensor:
     """(8, 4, 4) camera from world: a cube's corners, one unit from the origin."""
     corners = torch.tensor(list(itertools.product((-1.0, 1.0), repeat=3))) / math.sqrt(3)
@@ -173,9 +184,7 @@ def _fixed_poses() -> Tensor:
 
 def _flat_maps(size: int) -> Tensor:
     """(4, 8, S, S): every pixel at its centre and at the origin's depth, undecided whether it is empty."""
-    centres = torch.arange(size) + 0.5
-    x, y = centres.expand(size, size), centres[:, None].expand(size, size)
-    maps = torch.stack([x, y, torch.ones(size, size), torch.zeros(size, size)])
+    maps = torch.cat([pixel_centres(size), torch.ones(1, size, size), torch.zeros(1, size, size)])
     return maps[:, None].repeat(1, _VIEWS, 1, 1)
 
 

@@ -45,10 +45,9 @@ def correlation(bench: Workbench) -> dict[str, Any]:
     bench.train_all(bench.configs(as_it_is))
     views = min(VIEWS, bench.split(config, "test").views)
     seeds = range(bench.seeds)
-    bench.measure_all(_agreed, [(seed, views) for seed in seeds])
-    bench.measure_all(_of_group, [(seed, views, group) for seed in seeds for group in range(GROUPS)])
-    agreed = [_agreed(bench, seed, views) for seed in seeds]
-    groups = [stacked([_of_group(bench, seed, views, group) for group in range(GROUPS)]) for seed in seeds]
+    bench.measure_all(_measured, [(seed, views, group) for seed in seeds for group in (None, *range(GROUPS))])
+    agreed = [_measured(bench, seed, views, None) for seed in seeds]
+    groups = [stacked([_measured(bench, seed, views, group) for group in range(GROUPS)]) for seed in seeds]
     result = bench.about(bench.config(as_it_is, seed=0)) | {
         "shapes": agreed[0]["cd"].shape[0],
         "views": views,
@@ -66,14 +65,13 @@ def correlation(bench: Workbench) -> dict[str, Any]:
     return result
 
 
-def _agreed(bench: Workbench, seed: int, views: int) -> Scores:
+def _measured(bench: Workbench, seed: int, views: int, group: int | None) -> Scores:
+    """A training's figures with a group of random codes, or, without a number, with the codes that are agreed on."""
     config = bench.config(as_it_is, seed=seed)
-    return bench.scores(config, config.inference, views=views)
-
-
-def _of_group(bench: Workbench, seed: int, views: int, group: int) -> Scores:
+    if group is None:
+        return bench.scores(config, config.inference, views=views)
     random = InferenceConfig(groups=1, steps=0)
-    return bench.scores(bench.config(as_it_is, seed=seed), random, views=views, code_seed=1 + group)
+    return bench.scores(config, random, views=views, code_seed=1 + group)
 
 
 def _claims(result: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -99,8 +99,7 @@ def health(bench: Workbench) -> dict[str, Any]:
     missing = [training for training in trainings if not _kept_at(bench, *training).exists()]
     if bench.processes > 1 and len(missing) > 1:
         calls = [(bench.in_a_process(), *training) for training in missing]
-        processes = min(bench.processes, len(missing))
-        run_side_by_side(_curve, calls, processes=processes, title="trainings", progress=bench.progress)
+        run_side_by_side(_curve, calls, processes=bench.processes, title="trainings", progress=bench.progress)
     for training in tqdm(trainings, desc="trainings", unit="training", disable=not bench.progress):
         root, name, _, _ = training
         curves.setdefault(root.name, {}).setdefault(name, []).append(_curve(bench, *training))

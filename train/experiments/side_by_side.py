@@ -37,13 +37,14 @@ def run_side_by_side(
     Args:
         function: importable by name; it and its arguments are pickled.
         arguments: of every call.
-        processes: at once.
+        processes: at once, if there are as many calls.
         title: of the bar: what is done, in the plural.
         progress: show it.
 
     Raises:
         UserError: a process was ended from outside.
     """
+    processes = min(processes, len(arguments))
     context = multiprocessing.get_context("spawn")
     waiting, running = deque(arguments), set[Future[object]]()
     failed: BaseException | None = None

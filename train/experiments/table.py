@@ -161,7 +161,7 @@ class Table:
 
         def needed(row: Row, seed: int) -> bool:
             config = self.config(row, bench, seed=seed)
-            return not bench.has(lambda asked: row.measure(row, asked, config))
+            return not bench.has(lambda asked: measured(asked, row, config))
 
         return [
             self._training(row, bench, seed)

@@ -164,11 +164,15 @@ class Workbench:
 
     def has(self, measure: Callable[[Workbench], object]) -> bool:
         """Are the scores kept that a measurement would take? Then it needs no network."""
+        return self._lacks(measure) is None
+
+    def _lacks(self, measure: Callable[[Workbench], object]) -> str | None:
+        """The first scores that a measurement would take, because they are not kept."""
         try:
             measure(dataclasses.replace(self, measures=False))
-        except Unmeasured:
-            return False
-        return True
+        except Unmeasured as scores:
+            return str(scores)
+        return None
 
     def missing(self, configs: Sequence[FitConfig]) -> tuple[list[FitConfig], list[FitConfig]]:
         """The runs that trainings still need, each once: those that start afresh, and those that start from them."""
@@ -187,11 +191,10 @@ class Workbench:
             UserError: one could not be trained; the others that were under way have come to their end.
         """
         for missing in self.missing(configs):
-            processes = min(self.processes, len(missing))
-            if processes > 1:
+            if min(self.processes, len(missing)) > 1:
                 calls = [(self.in_a_process(), config) for config in missing]
                 run_side_by_side(
-                    _train, calls, processes=processes, title="trainings", progress=self.progress
+                    _train, calls, processes=self.processes, title="trainings", progress=self.progress
                 )
                 continue
             threads = torch.get_num_threads()
@@ -215,18 +218,15 @@ class Workbench:
         """
         if self.processes == 1:
             return
-        asked = dataclasses.replace(self, measures=False)
         missing: dict[str, tuple[Any, ...]] = {}
         for given in arguments:
-            try:
-                measure(asked, *given)
-            except Unmeasured as scores:
-                missing.setdefault(str(scores), given)
+            scores = self._lacks(lambda asked, given=given: measure(asked, *given))
+            if scores is not None:
+                missing.setdefault(scores, given)
         if len(missing) > 1:
             calls = [(measure, self.in_a_process(), *given) for given in missing.values()]
-            processes = min(self.processes, len(missing))
             run_side_by_side(
-                _measure, calls, processes=processes, title="measurements", progress=self.progress
+                _measure, calls, processes=self.processes, title="measurements", progress=self.progress
             )
 
     def in_a_process(self) -> Workbench:
@@ -392,7 +392,7 @@ def _train(bench: Workbench, config: FitConfig) -> None:
 
 
 def _measure(measure: Callable[..., object], bench: Workbench, *given: Any) -> None:
-    measure(bench, *given)
+    measure(bench, *given)  # what it found is kept, and need not be sent back
 
 
 def _digest(text: str) -> str:
