@@ -18,8 +18,10 @@ $(VENV)/installed: pyproject.toml constraints.txt
 demo: $(VENV)/installed
 	$(BIN)/python -m train demo --out demo
 
+# Two processes, because compiling kernels keeps one core busy: 8 minutes instead of 11 on two cores. A file's tests stay
+# together, they share kernels and trained runs.
 test: $(VENV)/installed
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 slow: $(VENV)/installed
 	$(BIN)/python -m pytest -m slow --timeout 3600
