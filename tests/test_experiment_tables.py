@@ -14,10 +14,11 @@ import torch
 from models import build_generator
 from models.parts import prepare_images
 from train.checkpoint import best_weights
-from train.config import FitConfig
+from train.config import FitConfig, scaled
 from train.errors import UserError
-from train.experiments import Workbench, run_experiment
+from train.experiments import EXPERIMENTS, Workbench, run_experiment
 from train.experiments.health import VARIANTS
+from train.experiments.ledger import overview
 from train.experiments.paper import (
     DETERMINISTIC,
     TABLES,
@@ -213,6 +214,14 @@ def test_an_interrupted_training_is_finished_to_the_same_weights(bench: Workbenc
     assert json.loads((run / "trained.json").read_text())["continued"]
 
 
+def test_a_training_of_one_stage_is_told_as_done(bench: Workbench, tmp_path: Path) -> None:
+    elsewhere = dataclasses.replace(bench, out=tmp_path)
+    config = scaled(elsewhere.config(of_system("psgn"), seed=0), 0.5)
+    assert not elsewhere.is_trained(config)
+    elsewhere.train(config)
+    assert elsewhere.is_trained(config)
+
+
 def test_other_data_are_another_run(bench: Workbench, tiny_data: Path, tmp_path: Path) -> None:
     config = bench.config(deterministic, seed=0)
     for split in ("train", "val", "test"):
@@ -247,7 +256,11 @@ def test_a_verdict_says_what_the_numbers_say(bench: Workbench) -> None:
 
 def test_health_compares_what_it_says(tiny_data: Path, tmp_path: Path) -> None:
     bench = Workbench((tiny_data,), tmp_path, "smoke", seeds=1, steps=6, progress=False)
+    before = next(overview({"health": EXPERIMENTS["health"]}, bench))
     result = run_experiment("health", bench)
+    after = next(overview({"health": EXPERIMENTS["health"]}, bench))
+    assert (before.trained, after.trained, after.runs, after.seconds) == (0, len(VARIANTS), len(VARIANTS), 0)
+    assert before.seconds is None  # no training of the kind was timed in this directory
     rows = result["trees"][tiny_data.name]
     assert list(rows) == list(VARIANTS)
     usual = rows["as it is"]

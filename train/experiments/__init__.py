@@ -12,7 +12,7 @@ from train.experiments.agreement import agreement
 from train.experiments.correlation import correlation
 from train.experiments.critic import critic
 from train.experiments.front_vs_projection import networks, study
-from train.experiments.health import health
+from train.experiments.health import health, own_trainings
 from train.experiments.ledger import Experiment, answer, answer_all, list_lines, overview
 from train.experiments.one_armed import measure
 from train.experiments.page import write_page
@@ -56,7 +56,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "reconstructions": Experiment(reconstructions.reconstructions, reconstructions.configs),
     "one-armed": Experiment(measure.one_armed, measure.configs),
     "agreement": Experiment(_agreement, lambda bench: _ours(bench)[:1]),
-    "health": Experiment(health, lambda bench: []),
+    "health": Experiment(health, lambda bench: [], own_trainings=own_trainings),
     "front-vs-projection": Experiment(study.front_vs_projection, networks.configs),
     "photos": Experiment(
         lambda bench: photos.photos(bench, bench.pictures),

@@ -83,6 +83,11 @@ VARIANTS: dict[str, Variant] = {
 }
 
 
+def own_trainings(bench: Workbench) -> dict[Path, FitConfig]:
+    """Every training, by the file that its measurements leave; no other experiment has a use for them."""
+    return {_kept_at(bench, *each): _config(bench, *each[1:]) for each in _trainings(bench)}
+
+
 def health(bench: Workbench) -> dict[str, Any]:
     """Trains every variant on every data tree with every seed; writes health.json, .md and .png.
 
@@ -91,20 +96,18 @@ def health(bench: Workbench) -> dict[str, Any]:
     Returns:
         What health.json holds.
     """
-    steps = bench.steps or STEPS
     curves: dict[str, dict[str, list[list[dict[str, float]]]]] = {}
-    trainings = [
-        (root, name, seed, steps) for root in bench.data for name in VARIANTS for seed in range(bench.seeds)
-    ]
+    trainings = _trainings(bench)
     missing = [training for training in trainings if not _kept_at(bench, *training).exists()]
     if bench.processes > 1 and len(missing) > 1:
         calls = [(bench.in_a_process(), *training) for training in missing]
         run_side_by_side(_curve, calls, processes=bench.processes, title="trainings", progress=bench.progress)
     for training in tqdm(trainings, desc="trainings", unit="training", disable=not bench.progress):
-        root, name, _, _ = training
+        root, name, _ = training
         curves.setdefault(root.name, {}).setdefault(name, []).append(_curve(bench, *training))
     result = {
-        "profile": bench.profile, "data": [str(root) for root in bench.data], "seeds": bench.seeds, "steps": steps,
+        "profile": bench.profile, "data": [str(root) for root in bench.data], "seeds": bench.seeds,
+        "steps": _steps(bench),
         "trees": {tree: {name: _summary(runs) for name, runs in rows.items()} for tree, rows in curves.items()},
         "curves": curves,
     }  # fmt: skip
@@ -114,22 +117,36 @@ def health(bench: Workbench) -> dict[str, Any]:
     return result
 
 
-def _curve(bench: Workbench, root: Path, name: str, seed: int, steps: int) -> list[dict[str, float]]:
-    """The measurements of one training, taken now or read."""
-    variant, base = VARIANTS[name], bench.config(without_critic, seed=seed)
-    stage = base.stage1.lasting(steps)
-    for change in variant.stage:
+def _trainings(bench: Workbench) -> list[tuple[Path, str, int]]:
+    """Data tree, variant and seed of every training."""
+    return [(root, name, seed) for root in bench.data for name in VARIANTS for seed in range(bench.seeds)]
+
+
+def _steps(bench: Workbench) -> int:
+    return bench.steps or STEPS
+
+
+def _config(bench: Workbench, name: str, seed: int) -> FitConfig:
+    """A variant's recipe; stage 2 is in it and is not trained."""
+    base = bench.config(without_critic, seed=seed)
+    stage = base.stage1.lasting(_steps(bench))
+    for change in VARIANTS[name].stage:
         stage = change(stage)
-    config = dataclasses.replace(base, stage1=stage)
+    return dataclasses.replace(base, stage1=stage)
+
+
+def _curve(bench: Workbench, root: Path, name: str, seed: int) -> list[dict[str, float]]:
+    """The measurements of one training, taken now or read."""
+    config = _config(bench, name, seed)
 
     # The name is for people; what the measurements belong to is the configuration and the tree.
     key = [name, dataclasses.replace(bench, data=(root,)).run_of(config).name]
-    path = _kept_at(bench, root, name, seed, steps)
-    return kept(path, key, lambda: _train(config, variant, *_read(root, config)))
+    path = _kept_at(bench, root, name, seed)
+    return kept(path, key, lambda: _train(config, VARIANTS[name], *_read(root, config)))
 
 
-def _kept_at(bench: Workbench, root: Path, name: str, seed: int, steps: int) -> Path:
-    return bench.out / "health" / f"{root.name}-{name.replace(' ', '-')}-{steps}-seed{seed}.json"
+def _kept_at(bench: Workbench, root: Path, name: str, seed: int) -> Path:
+    return bench.out / "health" / f"{root.name}-{name.replace(' ', '-')}-{_steps(bench)}-seed{seed}.json"
 
 
 def _read(root: Path, config: FitConfig) -> tuple[LoadedSplit, LoadedSplit]:

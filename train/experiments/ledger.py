@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from train.config import FitConfig, fit_config_from_json
 from train.errors import UserError
-from train.experiments.workbench import Workbench, parts_of
+from train.experiments.workbench import Workbench, parts_of, stage1_of
 from train.files import write_text
 
 # Of the cpu profile, processor time on one core of an Intel Xeon of 2024; taken until a run of the same kind has been
@@ -29,11 +29,14 @@ class Experiment(NamedTuple):
         make: trains and measures what is missing, and writes the answer into `bench.out`.
         configs: every training that it needs.
         files: what it reads beside data trees; with other bytes in them, the answer is another one.
+        own_trainings: of its trainings those that are no runs, of which only the first phase is trained, by the file
+            that each leaves.
     """
 
     make: Callable[[Workbench], dict[str, Any]]
     configs: Callable[[Workbench], list[FitConfig]]
     files: Callable[[Workbench], list[Path]] = lambda bench: []
+    own_trainings: Callable[[Workbench], dict[Path, FitConfig]] = lambda bench: {}
 
 
 class Line(NamedTuple):
@@ -42,9 +45,9 @@ class Line(NamedTuple):
     Attributes:
         name: the experiment's.
         done: its answer is there, of just this bench.
-        trained: how many of its runs there are.
+        trained: how many of its trainings there are.
         runs: how many it needs, some of which it may share with others.
-        seconds: what the missing runs will take on one core; None if nothing like them was timed yet.
+        seconds: what the missing ones will take on one core; None if nothing like them was timed yet.
     """
 
     name: str
@@ -67,9 +70,12 @@ def overview(experiments: Mapping[str, Experiment], bench: Workbench) -> Iterato
         missing = [run for run, (part, _) in parts.items() if not trees.is_trained(part)]
         costs = [_seconds(*parts[run], speeds) for run in missing if run not in counted]
         counted |= set(missing)
+        own = experiment.own_trainings(trees)
+        missing_own = [config for path, config in own.items() if not path.exists()]
+        costs += [_seconds(stage1_of(config), False, speeds) for config in missing_own]
         seconds = None if None in costs else sum(cost for cost in costs if cost is not None)
-        done = is_done(name, experiment, bench)
-        yield Line(name, done, len(parts) - len(missing), len(parts), seconds)
+        runs, lacking = len(parts) + len(own), len(missing) + len(missing_own)
+        yield Line(name, is_done(name, experiment, bench), runs - lacking, runs, seconds)
 
 
 def _with_data(bench: Workbench) -> Workbench:
@@ -131,7 +137,8 @@ def _key(experiment: Experiment, bench: Workbench) -> dict[str, Any]:
     depends += [hashlib.sha256(path.read_bytes()).hexdigest() for path in experiment.files(bench)]
     if trees.data:  # some experiments need none
         depends += trees.fingerprints()
-        depends += sorted({trees.run_of(config).name for config in experiment.configs(trees)})
+        configs = [*experiment.configs(trees), *experiment.own_trainings(trees).values()]
+        depends += sorted({trees.run_of(config).name for config in configs})
     digest = hashlib.sha256("\n".join(depends).encode()).hexdigest()[:12]
     settings = {name: getattr(bench, name) for name in ("profile", "seeds", "limit", "steps")}
     return {"depends_on": digest, **settings}

@@ -186,7 +186,7 @@ def _figure(result: Mapping[str, Any], objects: Sequence[_Object], answers: Sequ
     most = max(len(found.pictures) for found in objects)
     shown = min(most, _SHOWN_PICTURES)
     figure, panels = figures.grid(rows=len(objects), columns=shown + CODES + 2)
-    front = orbit_camera(np.array([30.0]), np.array([20.0]), 128).to(dtype=torch.float32)
+    sides = orbit_camera(np.array([30.0, 210.0]), np.array([20.0, 20.0]), 128).to(dtype=torch.float32)
     for line, found, made in zip(panels, objects, answers, strict=True):
         for axes in line[:shown]:
             figures.bare(axes)
@@ -196,10 +196,10 @@ def _figure(result: Mapping[str, Any], objects: Sequence[_Object], answers: Sequ
             line[0], f"{found.name}, {len(found.pictures)} picture{'s' if len(found.pictures) > 1 else ''}"
         )
         everything = torch.cat([made["agreed"], made["one"].flatten(0, 1)])
-        close = figures.narrowed(front, everything)
+        close = figures.narrowed(sides, everything)
         for axes, cloud in zip(line[shown:-2], made["one"], strict=True):
             figures.draw_cloud(axes, cloud, close[0])
-        for axes, camera in zip(line[-2:], (close[0], figures.from_behind(close[0])), strict=True):
+        for axes, camera in zip(line[-2:], (close[0], close[1]), strict=True):
             figures.draw_cloud(axes, made["agreed"], camera)
         before, _, after = made["losses"].tolist()
         if len(found.pictures) > 1:

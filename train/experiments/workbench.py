@@ -129,7 +129,7 @@ class Workbench:
 
     def is_trained(self, config: FitConfig) -> bool:
         """Has a configuration's training come to its end?"""
-        return (self.run_of(config) / "trained.json").exists()
+        return (self.run_of(parts_of(config)[-1]) / "trained.json").exists()
 
     def train(self, config: FitConfig, *, stage: Literal[1, 2] = 2) -> Path:
         """The run with a stage of a configuration's training: made now, continued, or there already.
