@@ -77,7 +77,7 @@ def test_what_is_listed_is_so(bench: Workbench) -> None:
     run = bench.run_of(_shared(bench)[0])
     (run / "trained.json").write_text(json.dumps({"seconds": 20, "continued": False}))
     first, second = overview(experiments, bench)
-    assert (first.trained, first.seconds) == (2, 0)
+    assert (first.trained, first.seconds, first.whole) == (2, 0, 28)
     assert (second.trained, second.seconds) == (
         1,
         20,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,6 +48,7 @@ class Line(NamedTuple):
         trained: how many of its trainings there are.
         runs: how many it needs, some of which it may share with others.
         seconds: what the missing ones will take on one core; None if nothing like them was timed yet.
+        whole: what all of them take, those that are there as they were timed; None as before.
     """
 
     name: str
@@ -55,10 +56,11 @@ class Line(NamedTuple):
     trained: int
     runs: int
     seconds: float | None
+    whole: float | None
 
 
 def overview(experiments: Mapping[str, Experiment], bench: Workbench) -> Iterator[Line]:
-    """Says of every experiment where it stands; a missing run that several need counts for the first."""
+    """Says of every experiment where it stands; what a run takes that several need counts for the first."""
     trees = _with_data(bench)
     speeds, counted = _speeds(bench), set[Path]()
     for name, experiment in experiments.items():
@@ -67,15 +69,36 @@ def overview(experiments: Mapping[str, Experiment], bench: Workbench) -> Iterato
             for config in experiment.configs(trees)
             for number, part in enumerate(parts_of(config))
         }
-        missing = [run for run, (part, _) in parts.items() if not trees.is_trained(part)]
-        costs = [_seconds(*parts[run], speeds) for run in missing if run not in counted]
-        counted |= set(missing)
+        costs = {run: _cost(run, *each, speeds) for run, each in parts.items() if run not in counted}
+        missing = {run for run, (part, _) in parts.items() if not trees.is_trained(part)}
+        counted |= set(parts)
         own = experiment.own_trainings(trees)
-        missing_own = [config for path, config in own.items() if not path.exists()]
-        costs += [_seconds(stage1_of(config), False, speeds) for config in missing_own]
-        seconds = None if None in costs else sum(cost for cost in costs if cost is not None)
-        runs, lacking = len(parts) + len(own), len(missing) + len(missing_own)
-        yield Line(name, is_done(name, experiment, bench), runs - lacking, runs, seconds)
+        costs |= {path: _seconds(stage1_of(config), False, speeds) for path, config in own.items()}
+        missing |= {path for path in own if not path.exists()}
+        runs = len(parts) + len(own)
+        yield Line(
+            name,
+            is_done(name, experiment, bench),
+            trained=runs - len(missing),
+            runs=runs,
+            seconds=_sum(costs[path] for path in missing & costs.keys()),
+            whole=_sum(costs.values()),
+        )
+
+
+def _sum(costs: Iterable[float | None]) -> float | None:
+    total = 0.0
+    for cost in costs:
+        if cost is None:
+            return None
+        total += cost
+    return total
+
+
+def _cost(run: Path, part: FitConfig, second: bool, speeds: Mapping[Kind, float]) -> float | None:
+    """What a run took, if it was timed from end to end, or what its kind takes."""
+    took = _timed(run)
+    return _seconds(part, second, speeds) if took is None else took
 
 
 def _with_data(bench: Workbench) -> Workbench:
@@ -156,13 +179,20 @@ def _speeds(bench: Workbench) -> dict[Kind, float]:
     """Processor seconds per step of the runs that were trained in one go; the newest of each kind."""
     found: dict[Kind, float] = {}
     notes = sorted((bench.out / "runs").glob("*/trained.json"), key=lambda path: path.stat().st_mtime)
-    for note in notes:
-        took = json.loads(note.read_text())
-        config = fit_config_from_json((note.parent / "config.json").read_text(), where=str(note.parent))
-        steps = sum(phase.steps for phase in config.phases.values())
-        if not took["continued"]:
-            found[_kind(config, second="stage1" not in config.phases)] = took["seconds"] / steps
+    for run in (note.parent for note in notes):
+        took = _timed(run)
+        if took is not None:
+            config = fit_config_from_json((run / "config.json").read_text(), where=str(run))
+            steps = sum(phase.steps for phase in config.phases.values())
+            found[_kind(config, second="stage1" not in config.phases)] = took / steps
     return found
+
+
+def _timed(run: Path) -> float | None:
+    """Processor seconds of a run that was trained in one go."""
+    note = run / "trained.json"
+    took = json.loads(note.read_text()) if note.exists() else {"continued": True}
+    return None if took["continued"] else took["seconds"]
 
 
 def _seconds(part: FitConfig, second: bool, speeds: Mapping[Kind, float]) -> float | None:
@@ -183,10 +213,12 @@ def list_lines(lines: list[Line], questions: Mapping[str, str], *, processes: in
         state = "done" if line.done else f"{line.trained}/{line.runs} runs" if line.runs else "to do"
         cost = "" if line.done or not line.runs else _duration(line.seconds, processes)
         printed.append(f"{line.name:{width}}  {state:>11}  {cost:>8}  {questions[line.name]}")
-    known = [line.seconds for line in lines if line.seconds is not None]
-    unknown = " and what has no time yet" if len(known) < len(lines) else ""
-    total = _duration(sum(known), processes)
-    return [*printed, f"trainings that are missing: {total}{unknown}, {processes} at once"]
+    missing, whole = (
+        _duration(sum(cost or 0 for cost in costs), processes)
+        + (" and what has no time yet" if None in costs else "")
+        for costs in zip(*((line.seconds, line.whole) for line in lines), strict=True)
+    )
+    return [*printed, f"trainings that are missing: {missing}; all of them: {whole}; {processes} at once"]
 
 
 def _duration(seconds: float | None, processes: int) -> str:
