@@ -13,7 +13,7 @@ import torch
 
 from models import build_generator
 from models.parts import prepare_images
-from train.checkpoint import best_weights
+from train.checkpoint import best_weights, load_autoencoder, load_critic
 from train.config import FitConfig, scaled
 from train.errors import UserError
 from train.experiments import EXPERIMENTS, Workbench, run_experiment
@@ -22,6 +22,7 @@ from train.experiments.ledger import overview
 from train.experiments.paper import (
     DETERMINISTIC,
     TABLES,
+    critic_of,
     deterministic,
     of_system,
     second_stage_alone,
@@ -112,6 +113,19 @@ def test_true_shapes_are_nearer_than_an_untaught_network_to_what_their_images_sh
         assert surface.mean() < 0.7 * network.mean()
 
 
+def test_a_critic_puts_answers_below_real_shapes_by_the_difference_of_its_scores(bench: Workbench) -> None:
+    run = bench.train(bench.config(with_critic, seed=0))
+    real, noise = torch.rand(2, 3, 128, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    shown = bench.split(bench.config(with_critic, seed=0), "test").batch(
+        torch.arange(3), torch.zeros(3, 1).long()
+    )
+    found = critic_of(run, real)(shown, torch.stack([real, noise]))["critic"]
+    of_real, of_noise = (load_critic(run)(load_autoencoder(run).encode(clouds)) for clouds in (real, noise))
+    assert (of_real - of_noise).abs().max() > 1e-6
+    expected = of_real.mean() - (of_real + of_noise) / 2
+    assert found.numpy() == pytest.approx(expected.numpy(), abs=1e-5)
+
+
 @pytest.mark.parametrize("table", TABLES.values(), ids=lambda table: table.name)
 def test_what_is_claimed_holds_for_the_papers_own_figures(table: Table) -> None:
     paper = {row.name: row.paper for row in table.rows}
@@ -173,10 +187,10 @@ def test_tables_share_what_is_trained(bench: Workbench) -> None:
 
 
 def test_scores_outlive_their_runs(bench: Workbench, tmp_path: Path) -> None:
-    shutil.copytree(bench.out / "scores", tmp_path / "scores")
-    elsewhere = dataclasses.replace(bench, out=tmp_path)
     table = dataclasses.replace(TABLES["deterministic"], claims=())
     first = make(table, bench)
+    shutil.copytree(bench.out / "scores", tmp_path / "scores")
+    elsewhere = dataclasses.replace(bench, out=tmp_path)
     assert make(table, elsewhere) == first
     assert not (tmp_path / "runs").exists()
     for path in (tmp_path / "scores").iterdir():

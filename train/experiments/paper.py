@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from models import Generator, Predictor
 from train.batches import Batch, LoadedSplit
+from train.checkpoint import load_autoencoder, load_critic
 from train.config import FitConfig, System, with_variant
 from train.errors import UserError
 from train.experiments.table import Claim, Row, Table, below
@@ -89,51 +92,67 @@ _ANSWERS = 10
 _NEAREST_AMONG = 300
 
 
-def _spread_of_answers(row: Row, bench: Workbench, config: FitConfig) -> Scores:
+def _ten_answers(row: Row, bench: Workbench, config: FitConfig) -> Scores:
     """Ten answers to one image: how far they are apart, from what it shows, and (one of them) from the nearest real
-    shape; the last two tell other shapes from noise. All are chamfer distances x100."""
+    shape, as chamfer distances x100; and how far a critic puts them below real shapes. All but the first tell other
+    shapes from noise."""
+    take = _of_samples if row.answer == "truth" else _of_predictions
     train = bench.split(config, "train")
-    some = _some_shapes(train)
+    some = torch.linspace(0, len(train) - 1, min(_NEAREST_AMONG, len(train))).long()
+    real = train.points[some, : cloud_size(config)]
+    among = [train.fingerprint, len(some)]
+    found = take(row, bench, config, "spread", among, lambda: functools.partial(_spread, real=real))
+    if row.judge is None:
+        return found
+    judge = bench.config(row.judge, seed=config.seed)
+    judged = [*among, bench.run_of(judge).name]
+    return found | take(row, bench, config, "critic", judged, lambda: critic_of(bench.train(judge), real))
+
+
+Figures = Callable[[Batch, Tensor], Scores]
+"""(B shapes and what is shown of them, (R, B, N, 3) answers) -> figure -> (B,)."""
+
+
+def _of_predictions(
+    row: Row, bench: Workbench, config: FitConfig, name: str, beside: list, figures: Callable[[], Figures]
+) -> Scores:
+    """Figures of what a network makes of one image with several codes."""
 
     def measure(model: Predictor, test: LoadedSplit) -> Scores:
         if not isinstance(model, Generator):
             raise UserError(f"{row.name} takes no codes")
-        real = train.points[some, : model.points]
+        of = figures()
         return joined(
-            [
-                _spread(clouds, shown, real)
-                for shown, clouds in answers(model, test, codes=_ANSWERS, seed=config.seed)
-            ]
+            [of(shown, clouds) for shown, clouds in answers(model, test, codes=_ANSWERS, seed=config.seed)]
         )
 
-    what = ["spread of answers", _ANSWERS, train.fingerprint, len(some)]
-    return bench.measured(config, what, measure, stage=row.stage)
+    return bench.measured(config, [f"{name} of answers", _ANSWERS, *beside], measure, stage=row.stage)
 
 
-def _spread_of_samples(row: Row, bench: Workbench, config: FitConfig) -> Scores:
+def _of_samples(
+    row: Row, bench: Workbench, config: FitConfig, name: str, beside: list, figures: Callable[[], Figures]
+) -> Scores:
     """The same figures of true shapes: what they are for samples of one surface, as large as a prediction where the
     data have points for two, and for shapes that are real."""
-    test, train = bench.split(config, "test"), bench.split(config, "train")
-    some = _some_shapes(train)
+    test = bench.split(config, "test")
     available, points = test.points.shape[1], cloud_size(config)
     size = min(points, available // 2)
 
     def take() -> Scores:
+        of = figures()
         order = torch.randperm(available, generator=torch.Generator().manual_seed(config.seed))
         samples = [part for part in order.split(size) if len(part) == size]
-        real = train.points[some, :points]
         return joined(
             [
-                _spread(torch.stack([test.points[shapes][:, sample] for sample in samples]), shown, real)
+                of(shown, torch.stack([test.points[shapes][:, sample] for sample in samples]))
                 for shapes, shown in one_view_each(test, config.seed)
             ]
         )
 
-    key = ["spread of samples", config.seed, points, test.fingerprint, train.fingerprint, len(some)]
-    return bench.kept(key, take)
+    return bench.kept([f"{name} of samples", config.seed, points, test.fingerprint, *beside], take)
 
 
-def _spread(clouds: Tensor, shown: Batch, real: Tensor) -> Scores:
+def _spread(shown: Batch, clouds: Tensor, *, real: Tensor) -> Scores:
     visible = [visible_error(cloud, shown.camera, shown.depth)[:, 0] for cloud in clouds]
     figures = {
         "diversity": distance_between(clouds),
@@ -143,18 +162,28 @@ def _spread(clouds: Tensor, shown: Batch, real: Tensor) -> Scores:
     return {name: values.double() for name, values in figures.items()}
 
 
-def _some_shapes(train: LoadedSplit) -> Tensor:
-    return torch.linspace(0, len(train) - 1, min(_NEAREST_AMONG, len(train))).long()
+def critic_of(run: Path, real: Tensor) -> Figures:
+    """How far a run's critic puts clouds below real ones (K, N, 3); only differences of its scores mean something."""
+    autoencoder, critic = load_autoencoder(run), load_critic(run)
+
+    def scores(clouds: Tensor) -> Tensor:
+        return critic(autoencoder.encode_frozen(clouds.contiguous())).double()
+
+    best = scores(real).mean()
+    return lambda shown, clouds: {"critic": best - torch.stack([scores(cloud) for cloud in clouds]).mean(0)}
 
 
 _RESAMPLED = "the truth, sampled again"
 DIVERSITY = Table(
     name="diversity",
     title="How different are ten answers to one image?",
-    columns=("diversity", "visible", "novelty"),
+    columns=("diversity", "visible", "novelty", "critic"),
     rows=(
         *(
-            Row(name=name, change=change, stage=1, measure=_spread_of_answers, paper={"diversity": theirs})
+            Row(
+                name=name, change=change, stage=1, measure=_ten_answers, judge=with_critic,
+                paper={"diversity": theirs},
+            )
             for name, change, theirs in (
                 ("whole clouds (EMD) + MoN", of_system("psgn-mon"), 1.65),
                 ("front constraint", without_diversity, 0.55),
@@ -164,7 +193,7 @@ DIVERSITY = Table(
                 ("diversity loss, beta 10", as_it_is, 3.36),
             )
         ),
-        Row(name=_RESAMPLED, answer="truth", measure=_spread_of_samples),
+        Row(name=_RESAMPLED, answer="truth", measure=_ten_answers, judge=with_critic),
     ),
     claims=(
         below("diversity", "front constraint", "diversity loss, beta 10", times=3),
@@ -175,7 +204,7 @@ DIVERSITY = Table(
         below("diversity", "diversity loss, beta 5", "diversity loss, beta 10"),
         below("diversity", _RESAMPLED, "diversity loss, beta 10"),
     ),
-)
+)  # fmt: skip
 
 _OURS = {"gt_to_pred": 1.39, "pred_to_gt": 1.98, "cd": 3.37, "fps_cd": 4.08, "fps_pred_to_gt": 2.35}
 _LIN = {"gt_to_pred": 1.66, "pred_to_gt": 2.35, "cd": 4.01, "fps_cd": 4.75, "fps_pred_to_gt": 2.59}

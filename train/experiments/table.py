@@ -32,7 +32,12 @@ NAMES = {
     "diversity": "diversity",
     "visible": "from what the image shows",
     "novelty": "to the nearest training shape",
+    "critic": "below real shapes by the critic",
 }
+_OF_THE_CRITIC = (
+    " By the critic: how much lower the mean score of answers is than that of training shapes, as the critic of a "
+    "training with one gives them (its scale is the auto-encoder's; not x100)."
+)
 # The paper trains stage 1 for 40 000 steps on one category and for 100 000 on thirteen. The full profile's lengths are
 # those for one, the cpu profile's are for all the families together.
 _CPU_STEPS_FOR_ONE_CATEGORY = 0.5
@@ -74,6 +79,7 @@ class Row:
         split: which shapes; a claim can compare rows of one split only.
         answer: "network", or what is answered instead of a trained one; "truth" needs a `measure` of its own.
         measure: takes the figures.
+        judge: how a training differs from the profile's whose critic judges the answers.
         paper: the paper's figures.
     """
 
@@ -86,6 +92,7 @@ class Row:
     split: Literal["train", "test"] = "test"
     answer: Literal["network", "medoid", "nearest image", "truth"] = "network"
     measure: Measure = reconstructions
+    judge: Change | None = None
     paper: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
@@ -154,7 +161,12 @@ class Table:
 
     def configs(self, bench: Workbench) -> list[FitConfig]:
         """Every training that the table rests on, no longer than it needs it, seed by seed."""
-        return [self._training(row, bench, seed) for seed in range(bench.seeds) for row in self._networks()]
+        return [
+            config
+            for seed in range(bench.seeds)
+            for row in self.rows
+            for config in self._trainings(row, bench, seed)
+        ]
 
     def missing(self, bench: Workbench) -> list[FitConfig]:
         """Those of `configs` whose scores are not kept."""
@@ -164,18 +176,22 @@ class Table:
             return not bench.has(lambda asked: measured(asked, row, config))
 
         return [
-            self._training(row, bench, seed)
+            config
             for seed in range(bench.seeds)
-            for row in self._networks()
+            for row in self.rows
             if needed(row, seed)
+            for config in self._trainings(row, bench, seed)
         ]
 
-    def _networks(self) -> list[Row]:
-        return [row for row in self.rows if row.answer == "network"]
-
-    def _training(self, row: Row, bench: Workbench, seed: int) -> FitConfig:
-        config = self.config(row, bench, seed=seed)
-        return stage1_of(config) if row.stage == 1 else config
+    def _trainings(self, row: Row, bench: Workbench, seed: int) -> list[FitConfig]:
+        """What a row rests on: its network, up to the stage that is measured, and its judge."""
+        found = []
+        if row.answer == "network":
+            config = self.config(row, bench, seed=seed)
+            found.append(stage1_of(config) if row.stage == 1 else config)
+        if row.judge is not None:
+            found.append(bench.config(row.judge, seed=seed))
+        return found
 
 
 def make(table: Table, bench: Workbench) -> dict[str, Any]:
@@ -325,7 +341,7 @@ def _head(result: Mapping[str, Any]) -> str:
     return (
         f"{result['title']} {result['shapes']} held-out shapes{of}, profile `{result['profile']}`, "
         f"{trainings(result['seeds'])} of each; un-squared distances x100, mean ± standard deviation over trainings. "
-        "In brackets: the paper."
+        "In brackets: the paper." + (_OF_THE_CRITIC if "critic" in result["columns"] else "")
     )
 
 
@@ -420,7 +436,8 @@ def figure(result: Mapping[str, Any]) -> Figure:
                 continue
             axes.barh(height, result["rows"][name]["mean"][column], color="#cfe8e0", height=0.6)
             axes.plot(values, [height] * len(values), "o", color="#1f6f8b", ms=5)
-        axes.set(xlabel=f"{NAMES[column]} x100", xlim=(0, None))
+        axes.set(xlabel=NAMES[column] + (" x100" if column != "critic" else ""))
+        axes.set_xlim(min(0, axes.get_xlim()[0]), None)
         figures.plain(axes)
         axes.grid(visible=False, axis="y")
     panels[0].set_yticks(range(len(rows)), rows)
