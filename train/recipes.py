@@ -46,7 +46,9 @@ _STAGES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
         ),
         "cpu": (
             {"steps": 8_000, "shapes": 16, "select": "cd"} | _rates(2e-3, 1e-4),
-            {"steps": 2_000, "shapes": 16, "select": "cd"} | _rates(1e-4, 1e-5),
+            # As published. With ten times as much the maps of thin parts are emptied faster than they are mended: the
+            # validation CD, on two data sets, rises above what the first phase had.
+            {"steps": 2_000, "shapes": 16, "select": "cd"} | _rates(1e-5, 1e-6),
         ),
         "smoke": (
             {"steps": 12, "shapes": 3, "select": "cd"} | _rates(1e-3),

@@ -246,6 +246,7 @@ SINGLE_CATEGORY = Table(
         Row(name="PTN", change=of_system("ptn"), paper=_PTN),
         Row(name="PSGN", change=of_system("psgn"), paper=_PSGN),
         Row(name="PSGN, views joined", change=of_system("psgn"), scored="joined"),
+        Row(name="Lin et al., fixed views alone", change=of_system("lin"), stage=1),
         Row(name="Lin et al.", change=of_system("lin"), paper=_LIN),
         Row(name="ours", paper=_OURS),
         Row(name="ours, random codes", codes="random"),
