@@ -46,8 +46,8 @@ _STAGES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
         ),
         "cpu": (
             {"steps": 8_000, "shapes": 16, "select": "cd"} | _rates(2e-3, 1e-4),
-            # As published. With ten times as much the maps of thin parts are emptied faster than they are mended: the
-            # validation CD, on two data sets, rises above what the first phase had.
+            # It begins as published. With ten times as much the maps of thin parts are emptied faster than they are
+            # mended: on two data sets the validation CD rises above what the first phase had.
             {"steps": 2_000, "shapes": 16, "select": "cd"} | _rates(1e-5, 1e-6),
         ),
         "smoke": (

@@ -27,7 +27,7 @@ from train.config import PROFILES, FitConfig, StageConfig
 from train.errors import UserError
 from train.experiments.paper import without_critic
 from train.experiments.side_by_side import run_side_by_side
-from train.experiments.workbench import Workbench
+from train.experiments.workbench import Workbench, stage1_of
 from train.files import kept, write_text
 from train.health import sensitivity
 from train.runs import read_split
@@ -85,7 +85,10 @@ VARIANTS: dict[str, Variant] = {
 
 def own_trainings(bench: Workbench) -> dict[Path, FitConfig]:
     """Every training, by the file that its measurements leave; no other experiment has a use for them."""
-    return {_kept_at(bench, *each): _config(bench, *each[1:]) for each in _trainings(bench)}
+    return {
+        _kept_at(bench, root, name, seed): stage1_of(_config(bench, name, seed))
+        for root, name, seed in _trainings(bench)
+    }
 
 
 def health(bench: Workbench) -> dict[str, Any]:

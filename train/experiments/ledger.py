@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from train.config import FitConfig, fit_config_from_json
 from train.errors import UserError
-from train.experiments.workbench import Workbench, parts_of, stage1_of
+from train.experiments.workbench import Workbench, parts_of
 from train.files import write_text
 
 # Of the cpu profile, processor time on one core of an Intel Xeon of 2024; taken until a run of the same kind has been
@@ -29,8 +29,7 @@ class Experiment(NamedTuple):
         make: trains and measures what is missing, and writes the answer into `bench.out`.
         configs: every training that it needs.
         files: what it reads beside data trees; with other bytes in them, the answer is another one.
-        own_trainings: of its trainings those that are no runs, of which only the first phase is trained, by the file
-            that each leaves.
+        own_trainings: of its trainings those that are no runs, by the file that each leaves.
     """
 
     make: Callable[[Workbench], dict[str, Any]]
@@ -62,18 +61,23 @@ class Line(NamedTuple):
 def overview(experiments: Mapping[str, Experiment], bench: Workbench) -> Iterator[Line]:
     """Says of every experiment where it stands; what a run takes that several need counts for the first."""
     trees = _with_data(bench)
-    speeds, counted = _speeds(bench), set[Path]()
+    timed, counted = _timed(bench), set[Path]()
+    speeds = _speeds(timed)
     for name, experiment in experiments.items():
         parts = {
             trees.run_of(part): (part, number > 0)
             for config in experiment.configs(trees)
             for number, part in enumerate(parts_of(config))
         }
-        costs = {run: _cost(run, *each, speeds) for run, each in parts.items() if run not in counted}
+        costs = {
+            run: timed[run] if run in timed else _seconds(*each, speeds)
+            for run, each in parts.items()
+            if run not in counted
+        }
         missing = {run for run, (part, _) in parts.items() if not trees.is_trained(part)}
         counted |= set(parts)
         own = experiment.own_trainings(trees)
-        costs |= {path: _seconds(stage1_of(config), False, speeds) for path, config in own.items()}
+        costs |= {path: _seconds(config, False, speeds) for path, config in own.items()}
         missing |= {path for path in own if not path.exists()}
         runs = len(parts) + len(own)
         yield Line(
@@ -93,12 +97,6 @@ def _sum(costs: Iterable[float | None]) -> float | None:
             return None
         total += cost
     return total
-
-
-def _cost(run: Path, part: FitConfig, second: bool, speeds: Mapping[Kind, float]) -> float | None:
-    """What a run took, if it was timed from end to end, or what its kind takes."""
-    took = _timed(run)
-    return _seconds(part, second, speeds) if took is None else took
 
 
 def _with_data(bench: Workbench) -> Workbench:
@@ -175,24 +173,21 @@ def _kind(config: FitConfig, *, second: bool) -> Kind:
     return config.profile, config.system, config.deterministic, second
 
 
-def _speeds(bench: Workbench) -> dict[Kind, float]:
-    """Processor seconds per step of the runs that were trained in one go; the newest of each kind."""
-    found: dict[Kind, float] = {}
+def _timed(bench: Workbench) -> dict[Path, float]:
+    """Processor seconds of the runs that were trained in one go, the newest last."""
     notes = sorted((bench.out / "runs").glob("*/trained.json"), key=lambda path: path.stat().st_mtime)
-    for run in (note.parent for note in notes):
-        took = _timed(run)
-        if took is not None:
-            config = fit_config_from_json((run / "config.json").read_text(), where=str(run))
-            steps = sum(phase.steps for phase in config.phases.values())
-            found[_kind(config, second="stage1" not in config.phases)] = took / steps
+    took = {note.parent: json.loads(note.read_text()) for note in notes}
+    return {run: each["seconds"] for run, each in took.items() if not each["continued"]}
+
+
+def _speeds(timed: Mapping[Path, float]) -> dict[Kind, float]:
+    """Processor seconds per step of runs; the newest of each kind."""
+    found: dict[Kind, float] = {}
+    for run, seconds in timed.items():
+        config = fit_config_from_json((run / "config.json").read_text(), where=str(run))
+        steps = sum(phase.steps for phase in config.phases.values())
+        found[_kind(config, second="stage1" not in config.phases)] = seconds / steps
     return found
-
-
-def _timed(run: Path) -> float | None:
-    """Processor seconds of a run that was trained in one go."""
-    note = run / "trained.json"
-    took = json.loads(note.read_text()) if note.exists() else {"continued": True}
-    return None if took["continued"] else took["seconds"]
 
 
 def _seconds(part: FitConfig, second: bool, speeds: Mapping[Kind, float]) -> float | None:

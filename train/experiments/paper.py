@@ -104,6 +104,7 @@ def _ten_answers(row: Row, bench: Workbench, config: FitConfig) -> Scores:
     found = take(row, bench, config, "spread", among, lambda: functools.partial(_spread, real=real))
     if row.judge is None:
         return found
+    # Kept apart from the distances, which depend on no critic.
     judge = bench.config(row.judge, seed=config.seed)
     judged = [*among, bench.run_of(judge).name]
     return found | take(row, bench, config, "critic", judged, lambda: critic_of(bench.train(judge), real))
