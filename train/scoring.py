@@ -11,6 +11,7 @@ from diffpoint import chamfer_distance, consistency_loss
 from models import Generator, Predictor
 from train.batches import Batch, LoadedSplit
 from train.config import InferenceConfig
+from train.errors import UserError
 from train.inference import reconstruct
 from train.metrics import cloud_errors, thin_out, transport_error
 
@@ -114,7 +115,9 @@ def compare(predicted: Tensor, truth: Tensor, *, points: int) -> Scores:
 
 
 @torch.no_grad()
-def answers(model: Generator, test: LoadedSplit, *, codes: int, seed: int) -> Iterator[tuple[Batch, Tensor]]:
+def answers(
+    model: Predictor, test: LoadedSplit, *, codes: int, seed: int
+) -> Iterator[tuple[Tensor, Batch, Tensor]]:
     """What a network makes of one image of each shape with several random codes, some shapes at a time.
 
     Args:
@@ -124,12 +127,18 @@ def answers(model: Generator, test: LoadedSplit, *, codes: int, seed: int) -> It
         seed: draws views and codes.
 
     Yields:
-        B shapes with the one view that is shown, and (R, B, N, 3) predictions in the world frame.
+        (B,) numbers of shapes, their batch with the one view that is shown, and (R, B, N, 3) predictions in the world
+        frame.
+
+    Raises:
+        UserError: the network takes no codes.
     """
+    if not isinstance(model, Generator):
+        raise UserError("several answers to one image come from a network with codes; this one has none")
     generator = torch.Generator().manual_seed(seed)
     for shapes, shown in one_view_each(test, seed):
         drawn = torch.randn(codes, len(shapes), model.code_dim, generator=generator)
-        yield shown, model(shown.images[:, 0], drawn).contiguous()
+        yield shapes, shown, model(shown.images[:, 0], drawn).contiguous()
 
 
 def one_view_each(test: LoadedSplit, seed: int) -> Iterator[tuple[Tensor, Batch]]:
@@ -144,10 +153,10 @@ def distance_between(answers: Tensor) -> Tensor:
     return 100 * consistency_loss(answers.transpose(0, 1), reduction="none")
 
 
-def diversity(model: Generator, test: LoadedSplit, *, codes: int, seed: int) -> Tensor:
+def diversity(model: Predictor, test: LoadedSplit, *, codes: int, seed: int) -> Tensor:
     """(M,) `distance_between` the predictions of one image with `codes` random codes."""
     found = answers(model, test, codes=codes, seed=seed)
-    return torch.cat([distance_between(clouds) for _, clouds in found])
+    return torch.cat([distance_between(clouds) for _, _, clouds in found])
 
 
 def distance_to_nearest(clouds: Tensor, among: Tensor) -> Tensor:

@@ -10,11 +10,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from models import Generator, Predictor
+from models import Predictor
 from train.batches import Batch, LoadedSplit
 from train.checkpoint import load_autoencoder, load_critic
 from train.config import FitConfig, System, with_variant
-from train.errors import UserError
 from train.experiments.table import Claim, Row, Table, below
 from train.experiments.workbench import Change, Workbench, as_it_is
 from train.metrics import visible_error
@@ -120,12 +119,9 @@ def _of_predictions(
     """Figures of what a network makes of one image with several codes."""
 
     def measure(model: Predictor, test: LoadedSplit) -> Scores:
-        if not isinstance(model, Generator):
-            raise UserError(f"{row.name} takes no codes")
         of = figures()
-        return joined(
-            [of(shown, clouds) for shown, clouds in answers(model, test, codes=_ANSWERS, seed=config.seed)]
-        )
+        found = answers(model, test, codes=_ANSWERS, seed=config.seed)
+        return joined([of(shown, clouds) for _, shown, clouds in found])
 
     return bench.measured(config, [f"{name} of answers", _ANSWERS, *beside], measure, stage=row.stage)
 

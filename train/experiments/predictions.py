@@ -95,8 +95,9 @@ def spread(clouds: Tensor, camera: PinholeCamera) -> dict[str, Tensor]:
 
 
 def _spreads(model: Generator, test: LoadedSplit, seed: int) -> Scores:
-    found = [spread(clouds, shown.camera) for shown, clouds in answers(model, test, codes=CODES, seed=seed)]
-    return {name: values.double() for name, values in joined(found).items()}
+    answered = answers(model, test, codes=CODES, seed=seed)
+    found = joined([spread(clouds, shown.camera) for _, shown, clouds in answered])
+    return {name: values.double() for name, values in found.items()}
 
 
 def _generator(bench: Workbench, config: Any) -> Generator:

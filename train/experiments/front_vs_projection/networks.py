@@ -12,13 +12,13 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, farthest_point_sample, nearest, visible_points
 from models import Predictor
-from train.batches import LoadedSplit
+from train.batches import Batch, LoadedSplit
 from train.config import FitConfig, InferenceConfig, StageConfig, Supervision, fit_config_from_json
 from train.experiments.workbench import Workbench
 from train.fit import STAGES
 from train.log import read_metrics
 from train.metrics import cloud_errors, in_silhouette, visible_error
-from train.scoring import SHAPES_AT_ONCE, Scores, joined, view_order
+from train.scoring import Scores, answers, joined, one_view_each
 from train.systems import size_of
 from train.validation import validate
 
@@ -105,7 +105,6 @@ def configs(bench: Workbench) -> list[FitConfig]:
     ]
 
 
-@torch.no_grad()
 def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> Scores:
     """Figure -> (M,) of each shape's prediction from its first view in a seed's order, with one random code.
 
@@ -114,33 +113,21 @@ def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> Scores:
     that it sees (1: as dense as behind); "imbalance": which share of the points would have to move to another of 32
     parts of the surface for all parts to be as dense (0 to 1).
     """
-    generator = torch.Generator().manual_seed(seed)
-    codes = torch.randn(1, len(test), model.code_dim, generator=generator)
-    first = view_order(test, seed)[:, :1]
-    clouds = [
-        model(test.float_images(shapes, first[shapes])[:, 0], codes[:, shapes])[0]
-        for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE)
-    ]
-    return beside_the_truth(torch.cat(clouds), test, first)
+    answered = answers(model, test, codes=1, seed=seed)
+    return joined([beside_the_truth(made[0], test.points[shapes], shown) for shapes, shown, made in answered])
 
 
-def beside_the_truth(clouds: Tensor, test: LoadedSplit, first: Tensor) -> Scores:
-    """The figures of `single_views` of clouds (M, N, 3), of which the views (M, 1) show something."""
-    parts: list[Scores] = []
-    for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
-        seen, truth, made = test.batch(shapes, first[shapes]), test.points[shapes], clouds[shapes]
-        errors = cloud_errors(made, truth)
-        parts.append(
-            {
-                "visible": visible_error(made, seen.camera, seen.depth)[:, 0],
-                "inside": in_silhouette(made, seen.camera, seen.depth).float().mean((1, 2)),
-                "cd_1": errors.cd,
-                "pred_to_gt": errors.pred_to_gt,
-                "gt_to_pred": errors.gt_to_pred,
-                **densities(made, truth, visible_points(truth, seen.camera, method="horizon")[:, 0]),
-            }
-        )
-    return joined(parts)
+def beside_the_truth(clouds: Tensor, truth: Tensor, shown: Batch) -> Scores:
+    """The figures of `single_views` of clouds (B, N, 3) beside true ones (B, P, 3), of which one view each is shown."""
+    errors = cloud_errors(clouds, truth)
+    return {
+        "visible": visible_error(clouds, shown.camera, shown.depth)[:, 0],
+        "inside": in_silhouette(clouds, shown.camera, shown.depth).float().mean((1, 2)),
+        "cd_1": errors.cd,
+        "pred_to_gt": errors.pred_to_gt,
+        "gt_to_pred": errors.gt_to_pred,
+        **densities(clouds, truth, visible_points(truth, shown.camera, method="horizon")[:, 0]),
+    }
 
 
 def densities(clouds: Tensor, truth: Tensor, seen: Tensor) -> Scores:
@@ -175,6 +162,7 @@ def study(bench: Workbench) -> dict[str, Any]:
         of validation with a verdict for each training.
     """
     bench.train_all(configs(bench))
+    bench.measure_all(_measured, _networks(bench))
     return {
         "shapes": len(bench.scores(configs(bench)[0], _RANDOM, views=_VIEWS)["cd"]),
         "seeds": bench.seeds,
@@ -203,6 +191,14 @@ class Examples(NamedTuple):
     clouds: dict[str, Tensor]
 
 
+def _networks(bench: Workbench) -> list[tuple[FitConfig, Literal[1, 2]]]:
+    """Everything that is measured: every training, after each of its stages."""
+    both: tuple[Literal[1, 2], ...] = (1, 2)
+    return [
+        (config, stage) for config in configs(bench) for stage in (both if config.stage1.steps else both[1:])
+    ]
+
+
 @torch.no_grad()
 def examples(bench: Workbench, *, count: int = 3) -> Examples:
     """Of the first training of each loss; the shapes are spread over the test split."""
@@ -228,11 +224,11 @@ def _floor(bench: Workbench) -> dict[str, float]:
     count = size_of(config).points
     generator = torch.Generator().manual_seed(0)
     some = torch.stack([torch.randperm(test.points.shape[1], generator=generator)[:count] for _ in test.ids])
-    clouds = test.clouds(torch.arange(len(test)), some)
-    return {
-        name: values.mean().item()
-        for name, values in beside_the_truth(clouds, test, view_order(test, 0)[:, :1]).items()
-    }
+    found = [
+        beside_the_truth(test.clouds(shapes, some[shapes]), test.points[shapes], shown)
+        for shapes, shown in one_view_each(test, 0)
+    ]
+    return {name: values.mean().item() for name, values in joined(found).items()}
 
 
 def _single(bench: Workbench, taught: Taught) -> dict[str, Any]:
