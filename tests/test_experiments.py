@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from train.errors import UserError
 from train.evaluate import evaluate
 from train.experiments import Workbench, run_experiment
 from train.experiments.agreement import WAYS, agreement
+from train.scoring import Scores, score
 
 _WAYS = {
     "random codes": InferenceConfig(groups=1, steps=0),
@@ -25,11 +27,10 @@ _WAYS = {
 
 
 def test_agreement_writes_what_it_measured(smoke_run: Path, tiny_data: Path, tmp_path: Path) -> None:
-    found = agreement(
-        smoke_run, tiny_data, tmp_path, seeds=(0, 1), views=3, limit=2, progress=False, ways=_WAYS
-    )
+    bench = Workbench((tiny_data,), tmp_path, "smoke", seeds=2, limit=2, progress=False)
+    found = agreement(bench, smoke_run, views=3, ways=_WAYS)
     assert json.loads((tmp_path / "agreement.json").read_text()) == json.loads(json.dumps(found))
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
+    assert sorted(path.name for path in tmp_path.glob("*.*")) == [
         f"agreement.{kind}" for kind in ("json", "md", "png")
     ]
     loss = {name: way["mean"]["consistency"] for name, way in found["ways"].items()}
@@ -48,11 +49,38 @@ def test_agreement_writes_what_it_measured(smoke_run: Path, tiny_data: Path, tmp
         assert picture.size[0] > 1000
 
 
+def test_agreement_goes_on_where_it_was(
+    smoke_run: Path, tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scored: list[object] = []
+
+    def counted(*args: object, **settings: object) -> Scores:
+        scored.append(settings)
+        if len(scored) == 3:
+            raise KeyboardInterrupt
+        return score(*args, **settings)
+
+    module = importlib.import_module("train.experiments.agreement")
+    monkeypatch.setattr(module, "score", counted)
+    monkeypatch.setattr(module, "_GROUPS", 2)
+    bench = Workbench((tiny_data,), tmp_path, "smoke", seeds=1, limit=2, progress=False)
+    with pytest.raises(KeyboardInterrupt):
+        agreement(bench, smoke_run, views=2, ways=_WAYS)
+    found = agreement(bench, smoke_run, views=2, ways=_WAYS)
+    assert (
+        len(scored) == 1 + len(_WAYS) + 2
+    )  # the one that was interrupted is the only one that is taken again
+    assert agreement(bench, smoke_run, views=2, ways=_WAYS) == found
+    assert len(scored) == 1 + len(_WAYS) + 2  # all was kept
+    other = tmp_path / "other.safetensors"
+    torch.manual_seed(0)
+    save_weights(build_generator("smoke"), other)
+    assert agreement(bench, other, views=2, ways=_WAYS)["ways"] != found["ways"]
+
+
 def test_random_codes_are_those_of_the_evaluation(smoke_run: Path, tiny_data: Path, tmp_path: Path) -> None:
-    found = agreement(
-        smoke_run, tiny_data, tmp_path, seeds=(0,), views=2, progress=False,
-        ways={"random codes": _WAYS["random codes"]},
-    )  # fmt: skip
+    bench = Workbench((tiny_data,), tmp_path, "smoke", seeds=1, progress=False)
+    found = agreement(bench, smoke_run, views=2, ways={"random codes": _WAYS["random codes"]})
     scored = evaluate(smoke_run, tiny_data, views=(2,), out=tmp_path / "evaluation.json", progress=False)
     assert found["ways"]["random codes"]["mean"] == pytest.approx(scored["random_codes"]["2"])
 

@@ -176,7 +176,7 @@ def view_order(test: LoadedSplit, seed: int) -> Tensor:
 
 
 def joined(parts: Sequence[Scores]) -> Scores:
-    """The scores of some shapes after those of others, (M,)."""
+    """The scores of some shapes after those of others, (M,); or of some seeds, (S, M)."""
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 

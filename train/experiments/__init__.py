@@ -33,10 +33,7 @@ def _ours(bench: Workbench) -> list[FitConfig]:
 def _agreement(bench: Workbench, *, run: Path | None = None, views: int = 8) -> dict[str, Any]:
     if run is None:
         run = bench.train(_ours(bench)[0])
-    return agreement(
-        run, bench.data[0], bench.out,
-        seeds=range(bench.seeds), views=views, limit=bench.limit, progress=bench.progress,
-    )  # fmt: skip
+    return agreement(bench, run, views=views)
 
 
 def _tables(tables: dict[str, Table]) -> dict[str, Experiment]:
@@ -83,10 +80,11 @@ def run_experiment(name: str, bench: Workbench, *, run: Path | None = None, view
         UserError: an unknown run, no usable data, or numbers out of range.
     """
     if name == "agreement" and (run is not None or views != 8):
-        return _agreement(bench, run=run, views=views)
-    if run is not None:
+        result = _agreement(bench, run=run, views=views)  # another question than the one that `all` answers
+    elif run is not None:
         raise UserError(f"the experiment {name} trains what it needs; leave --run out")
-    result = answer(name, EXPERIMENTS[name], bench)
+    else:
+        result = answer(name, EXPERIMENTS[name], bench)
     if bench.progress:
         print((bench.out / f"{name}.md").read_text())
     return result

@@ -11,10 +11,11 @@ Every way of choosing codes is scored on the same shapes, views and first random
 from __future__ import annotations
 
 import dataclasses
-import json
-from collections.abc import Sequence
+import hashlib
+import itertools
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from matplotlib.figure import Figure
@@ -29,9 +30,9 @@ from train.config import InferenceConfig
 from train.errors import UserError
 from train.experiments.correlation import pearson
 from train.experiments.table import table_row
-from train.files import write_text
+from train.experiments.workbench import Workbench
 from train.runs import open_run
-from train.scoring import Scores, means, score, spreads, stacked
+from train.scoring import Scores, joined, means, score, spreads, stacked
 
 _RANDOM = "random codes"
 WAYS: dict[str, InferenceConfig] = {
@@ -60,61 +61,70 @@ _COLUMNS = {
 }
 
 
+class _Asked(NamedTuple):
+    """One measurement: a way of choosing codes, and what is drawn.
+
+    Attributes:
+        settings: the way.
+        views: per shape.
+        seed: draws the views, and the codes if nothing else does.
+        code_seeds: each draws codes of its own.
+    """
+
+    settings: InferenceConfig
+    views: int
+    seed: int
+    code_seeds: tuple[int | None, ...] = (None,)
+
+
 def agreement(
-    run: Path,
-    data: Path,
-    out: Path,
-    *,
-    seeds: Sequence[int],
-    views: int,
-    limit: int | None = None,
-    progress: bool = True,
-    ways: dict[str, InferenceConfig] = WAYS,
+    bench: Workbench, run: Path, *, views: int, ways: Mapping[str, InferenceConfig] = WAYS
 ) -> dict[str, Any]:
-    """Scores every way of choosing codes; writes agreement.json, .md and .png into `out`.
+    """Scores every way of choosing codes; writes agreement.json, .md and .png.
 
     Args:
-        run: a run whose network takes codes.
-        data: root of a data tree; its test split is used.
-        out: directory to write to.
-        seeds: of codes and choice of views.
+        bench: the first tree's test split is used; its seeds draw codes and views.
+        run: a run whose network takes codes, as `train.runs.open_run` takes it.
         views: per shape, at least 2.
-        limit: at most that many shapes.
-        progress: show a bar, and the table at the end.
         ways: name -> settings; must hold "random codes".
 
     Returns:
         What agreement.json holds.
+
+    Raises:
+        UserError: no such run, one without codes, or numbers out of range.
     """
     opened = open_run(run)
     model, config = opened.model, opened.config
     if not isinstance(model, Generator) or model.config.deterministic:
         raise UserError(f"{run} takes no codes: there is nothing to agree on by choosing them")
-    test = opened.load_split(data, "test", limit=limit, progress=progress)
+    test = bench.split(config, "test")
     if not 2 <= views <= test.views:
-        raise UserError(f"--views must be between 2 and the {test.views} that {data} has; got {views}")
+        raise UserError(
+            f"--views must be between 2 and the {test.views} that {bench.data[0]} has; got {views}"
+        )
     if len(test) < 2:
-        raise UserError(f"one test shape has no spread; {data} or --limit must give at least 2")
-    if not seeds:
-        raise UserError("--seeds needs at least one number")
+        raise UserError(f"one test shape has no spread; {bench.data[0]} must give at least 2")
 
-    scores: dict[str, Scores] = {}
-    with tqdm(
-        total=len(test) * len(seeds) * (len(ways) + _GROUPS), unit="shape", disable=not progress
-    ) as bar:
-        for name, settings in ways.items():
-            bar.set_description(name)
-            scores[name] = stacked(
-                [score(model, test, settings, views=views, seed=seed, done=bar.update) for seed in seeds]
-            )
-        bar.set_description(f"{_GROUPS} groups of codes")
-        groups = _random_groups(model, test, views=views, count=_GROUPS * len(seeds), done=bar.update)
+    seeds = range(bench.seeds)
+    of_ways = {name: [_Asked(settings, views, seed) for seed in seeds] for name, settings in ways.items()}
+    of_groups = [
+        _Asked(ways[_RANDOM], views, 0, tuple(range(first, first + _GROUPS)))
+        for first in range(1, 1 + _GROUPS * len(seeds), _GROUPS)
+    ]
+    everything = [*itertools.chain(*of_ways.values()), *of_groups]
+    bench.measure_all(_measured, [(run, asked) for asked in everything])
+    # In one process nothing is kept yet: it is measured here.
+    bar = tqdm(everything, desc="ways of choosing codes", unit="measurement", disable=not bench.progress)
+    found = {asked: _measured(bench, run, asked) for asked in bar}
+    scores = {name: joined([found[asked] for asked in each]) for name, each in of_ways.items()}
+    groups = joined([found[asked] for asked in of_groups])
 
     result: dict[str, Any] = {
         "run": str(run),
         "profile": config.profile,
         "config": dataclasses.asdict(config),
-        "data": {"path": str(data), "shapes": len(test), "fingerprint": test.fingerprint},
+        "data": {"path": str(bench.data[0]), "shapes": len(test), "fingerprint": test.fingerprint},
         "seeds": list(seeds),
         "views": views,
         "floor": _floor(test, points=model.points, clouds=views),
@@ -131,23 +141,36 @@ def agreement(
         },
         "correlation": _correlation(groups),
     }
-    write_text(out / "agreement.json", json.dumps(result, indent=2) + "\n")
-    write_text(out / "agreement.md", _markdown(result))
-    figures.save(_figure(result, groups), out / "agreement.png")
-    if progress:
-        print(_markdown(result))
+    bench.publish("agreement", result, _markdown(result), _figure(result, groups))
     return result
 
 
-def _random_groups(model: Generator, test: LoadedSplit, *, views: int, count: int, done: Any) -> Scores:
-    """(G, M) scores of many groups of random codes for the same views of each shape."""
-    random = InferenceConfig(groups=1, steps=0)
-    return stacked(
-        [
-            score(model, test, random, views=views, seed=0, code_seed=1 + group, done=done)
-            for group in range(count)
+def _measured(bench: Workbench, run: Path, asked: _Asked) -> Scores:
+    """Figure -> (C, M) for each draw of codes and each shape, taken now or kept."""
+    opened = open_run(run)
+    test = bench.split(opened.config, "test")
+    settings, views, seed, code_seeds = asked
+
+    def take() -> Scores:
+        draws = [
+            score(opened.model, test, settings, views=views, seed=seed, code_seed=draw) for draw in code_seeds
         ]
-    )
+        return {name: values.double() for name, values in stacked(draws).items()}
+
+    # A run's name would not do: any run can be asked about, and one that trains on gets other weights.
+    weights = hashlib.sha256()
+    for name, values in opened.model.state_dict().items():
+        weights.update(name.encode() + values.numpy().tobytes())
+    key = [
+        "agreement",
+        weights.hexdigest(),
+        dataclasses.asdict(settings),
+        views,
+        seed,
+        code_seeds,
+        test.fingerprint,
+    ]
+    return bench.kept(key, take)
 
 
 def _floor(test: LoadedSplit, *, points: int, clouds: int) -> float:
