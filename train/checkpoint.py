@@ -118,18 +118,6 @@ def load_autoencoder(run_or_file: str | Path) -> Autoencoder:
     return _read(best_weights(path, "autoencoder") if path.is_dir() else path, Autoencoder).freeze()
 
 
-def load_critic(run: Path) -> Critic:
-    """Loads the critic of a run, frozen, as its newest checkpoint has it; it judges codes of the run's auto-encoder.
-
-    Raises:
-        UserError: the run has none, or it cannot be read.
-    """
-    newest = latest_checkpoint(run)
-    if newest is None:
-        raise UserError(f"{run} holds no checkpoint; train it first: fit --out {run}")
-    return _read(newest / "critic.safetensors", Critic).eval().requires_grad_(False)
-
-
 def config_of(run_or_file: str | Path, model: Predictor) -> FitConfig:
     """The configuration of a run, or for a lone file of weights that of its profile and system."""
     file = Path(run_or_file) / "config.json"

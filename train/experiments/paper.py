@@ -4,31 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from models import Predictor
-from train.batches import Batch, LoadedSplit
-from train.checkpoint import load_autoencoder, load_critic
+from train.batches import LoadedSplit
 from train.config import FitConfig, System, with_variant
 from train.experiments.table import Claim, Row, Table, below
+from train.experiments.ten_answers import ten_answers
 from train.experiments.workbench import Change, Workbench, as_it_is
-from train.metrics import visible_error
 from train.recipes import with_system
 from train.scoring import (
     SHAPES_AT_ONCE,
     Scores,
-    answers,
     compare,
-    distance_between,
-    distance_to_nearest,
     joined,
-    one_view_each,
 )
-from train.systems import METHODS, cloud_size
+from train.systems import METHODS
 
 
 def deterministic(config: FitConfig) -> FitConfig:
@@ -87,89 +79,6 @@ def second_stage_alone(config: FitConfig) -> FitConfig:
     )
 
 
-_ANSWERS = 10
-_NEAREST_AMONG = 300
-
-
-def _ten_answers(row: Row, bench: Workbench, config: FitConfig) -> Scores:
-    """Ten answers to one image: how far they are apart, from what it shows, and (one of them) from the nearest real
-    shape, as chamfer distances x100; and how far a critic puts them below real shapes. All but the first tell other
-    shapes from noise."""
-    take = _of_samples if row.answer == "truth" else _of_predictions
-    train = bench.split(config, "train")
-    some = torch.linspace(0, len(train) - 1, min(_NEAREST_AMONG, len(train))).long()
-    real = train.points[some, : cloud_size(config)]
-    among = [train.fingerprint, len(some)]
-    found = take(row, bench, config, "spread", among, lambda: functools.partial(_spread, real=real))
-    if row.judge is None:
-        return found
-    # Kept apart from the distances, which depend on no critic.
-    judge = bench.config(row.judge, seed=config.seed)
-    judged = [*among, bench.run_of(judge).name]
-    return found | take(row, bench, config, "critic", judged, lambda: critic_of(bench.train(judge), real))
-
-
-Figures = Callable[[Batch, Tensor], Scores]
-"""(B shapes and what is shown of them, (R, B, N, 3) answers) -> figure -> (B,)."""
-
-
-def _of_predictions(
-    row: Row, bench: Workbench, config: FitConfig, name: str, beside: list, figures: Callable[[], Figures]
-) -> Scores:
-    """Figures of what a network makes of one image with several codes."""
-
-    def measure(model: Predictor, test: LoadedSplit) -> Scores:
-        of = figures()
-        found = answers(model, test, codes=_ANSWERS, seed=config.seed)
-        return joined([of(shown, clouds) for _, shown, clouds in found])
-
-    return bench.measured(config, [f"{name} of answers", _ANSWERS, *beside], measure, stage=row.stage)
-
-
-def _of_samples(
-    row: Row, bench: Workbench, config: FitConfig, name: str, beside: list, figures: Callable[[], Figures]
-) -> Scores:
-    """The same figures of true shapes: what they are for samples of one surface, as large as a prediction where the
-    data have points for two, and for shapes that are real."""
-    test = bench.split(config, "test")
-    available, points = test.points.shape[1], cloud_size(config)
-    size = min(points, available // 2)
-
-    def take() -> Scores:
-        of = figures()
-        order = torch.randperm(available, generator=torch.Generator().manual_seed(config.seed))
-        samples = [part for part in order.split(size) if len(part) == size]
-        return joined(
-            [
-                of(shown, torch.stack([test.points[shapes][:, sample] for sample in samples]))
-                for shapes, shown in one_view_each(test, config.seed)
-            ]
-        )
-
-    return bench.kept([f"{name} of samples", config.seed, points, test.fingerprint, *beside], take)
-
-
-def _spread(shown: Batch, clouds: Tensor, *, real: Tensor) -> Scores:
-    visible = [visible_error(cloud, shown.camera, shown.depth)[:, 0] for cloud in clouds]
-    figures = {
-        "diversity": distance_between(clouds),
-        "visible": torch.stack(visible).mean(0),
-        "novelty": distance_to_nearest(clouds[0], real),
-    }
-    return {name: values.double() for name, values in figures.items()}
-
-
-def critic_of(run: Path, real: Tensor) -> Figures:
-    """How far a run's critic puts clouds below real ones (K, N, 3); only differences of its scores mean something."""
-    autoencoder, critic = load_autoencoder(run), load_critic(run)
-
-    def scores(clouds: Tensor) -> Tensor:
-        return critic(autoencoder.encode_frozen(clouds.contiguous())).double()
-
-    best = scores(real).mean()
-    return lambda shown, clouds: {"critic": best - torch.stack([scores(cloud) for cloud in clouds]).mean(0)}
-
-
 _RESAMPLED = "the truth, sampled again"
 DIVERSITY = Table(
     name="diversity",
@@ -178,7 +87,7 @@ DIVERSITY = Table(
     rows=(
         *(
             Row(
-                name=name, change=change, stage=1, measure=_ten_answers, judge=with_critic,
+                name=name, change=change, stage=1, measure=ten_answers, judge=with_critic,
                 paper={"diversity": theirs},
             )
             for name, change, theirs in (
@@ -190,7 +99,7 @@ DIVERSITY = Table(
                 ("diversity loss, beta 10", as_it_is, 3.36),
             )
         ),
-        Row(name=_RESAMPLED, answer="truth", measure=_ten_answers, judge=with_critic),
+        Row(name=_RESAMPLED, answer="truth", measure=ten_answers, judge=with_critic),
     ),
     claims=(
         below("diversity", "front constraint", "diversity loss, beta 10", times=3),

@@ -35,8 +35,8 @@ NAMES = {
     "critic": "below real shapes by the critic",
 }
 _OF_THE_CRITIC = (
-    " By the critic: how much lower the mean score of answers is than that of training shapes, as the critic of a "
-    "training with one gives them (its scale is the auto-encoder's; not x100)."
+    " By the critic: how much lower it scores answers than the true shapes, after it has learnt on training images to "
+    "tell just these answers from real shapes by an auto-encoder's codes (whose scale it has; not x100)."
 )
 # The paper trains stage 1 for 40 000 steps on one category and for 100 000 on thirteen. The full profile's lengths are
 # those for one, the cpu profile's are for all the families together.
@@ -79,7 +79,7 @@ class Row:
         split: which shapes; a claim can compare rows of one split only.
         answer: "network", or what is answered instead of a trained one; "truth" needs a `measure` of its own.
         measure: takes the figures.
-        judge: how a training differs from the profile's whose critic judges the answers.
+        judge: how a training differs from the profile's by whose auto-encoder a critic judges the answers.
         paper: the paper's figures.
     """
 
