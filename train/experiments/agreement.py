@@ -41,11 +41,9 @@ WAYS: dict[str, InferenceConfig] = {
     "best of 20 groups": InferenceConfig(groups=20, steps=0),
     "descent alone, 30 x 0.1": InferenceConfig(groups=1, steps=30, step_size=0.1),
     "best of 5, 10 x 0.1": InferenceConfig(steps=10, step_size=0.1),
-    "best of 5, 30 x 0.02": InferenceConfig(steps=30, step_size=0.02),
     "best of 5, 30 x 0.1": InferenceConfig(steps=30, step_size=0.1),
     "best of 5, 30 x 0.5 (the paper's)": InferenceConfig(steps=30, step_size=0.5),
     "best of 5, 30 x 1.0": InferenceConfig(steps=30, step_size=1.0),
-    "best of 5, 100 x 0.1": InferenceConfig(steps=100, step_size=0.1),
     "30 x 0.5, codes of constant length": InferenceConfig(steps=30, step_size=0.5, keep_norm=True),
     "30 x 0.5, pulled to N(0, 1)": InferenceConfig(steps=30, step_size=0.5, prior=0.02),
 }
