@@ -100,7 +100,9 @@ def test_a_missing_run_is_counted_once(bench: Workbench) -> None:
     assert second.seconds == 0
 
 
-def test_what_is_done_stays_done_and_what_fails_stops_no_other(bench: Workbench) -> None:
+def test_what_is_done_stays_done_and_what_fails_stops_no_other(
+    bench: Workbench, capsys: pytest.CaptureFixture[str]
+) -> None:
     experiments = {
         "views": Experiment(_write("views"), lambda bench: []),
         "health": Experiment(_write("health", fails=True), lambda bench: []),
@@ -118,6 +120,9 @@ def test_what_is_done_stays_done_and_what_fails_stops_no_other(bench: Workbench)
     assert is_done("views", views, bench)
     (bench.out / "views.png").unlink()
     assert not is_done("views", views, bench)
+    capsys.readouterr()
+    assert answer_all(experiments, dataclasses.replace(bench, progress=True)) == ["views"]
+    assert capsys.readouterr().err == "-- views\n-- views: made in 0 min\n"
 
 
 def test_what_an_answer_was_made_from_belongs_to_it(bench: Workbench) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -141,9 +142,12 @@ def answer_all(experiments: Mapping[str, Experiment], bench: Workbench) -> list[
             continue
         if bench.progress:
             print(f"-- {name}", file=sys.stderr)
+        begin = time.monotonic()
         try:
             answer(name, experiment, bench)
             made.append(name)
+            if bench.progress:
+                print(f"-- {name}: made in {_duration(time.monotonic() - begin, 1)}", file=sys.stderr)
         except UserError as error:
             failed.append(f"{name}: {error}")
     if failed:
