@@ -409,8 +409,11 @@ def mean_and_spread(found: Mapping[str, Any]) -> str:
     Example:
         >>> mean_and_spread({"mean": 1.0, "sd": 0.126})
         '1.00 ± 0.13'
+        >>> mean_and_spread({"mean": -0.001, "sd": None})
+        '0.00'
     """
-    return f"{found['mean']:.2f}" + ("" if found["sd"] is None else f" ± {found['sd']:.2f}")
+    mean = round(found["mean"], 2) + 0.0  # a zero without its sign
+    return f"{mean:.2f}" + ("" if found["sd"] is None else f" ± {found['sd']:.2f}")
 
 
 def table_row(cells: Sequence[str]) -> str:
