@@ -118,12 +118,11 @@ def agreement(
     scores = {name: joined([found[asked] for asked in each]) for name, each in of_ways.items()}
     groups = joined([found[asked] for asked in of_groups])
 
-    result: dict[str, Any] = {
+    result: dict[str, Any] = bench.about(config) | {
+        "profile": config.profile,  # the run's, whatever the bench would train
         "run": str(run),
-        "profile": config.profile,
-        "config": dataclasses.asdict(config),
-        "data": {"path": str(bench.data[0]), "shapes": len(test), "fingerprint": test.fingerprint},
-        "seeds": list(seeds),
+        "shapes": len(test),
+        "fingerprint": test.fingerprint,
         "views": views,
         "floor": _floor(test, points=model.points, clouds=views),
         "ways": {
@@ -234,9 +233,9 @@ def _markdown(result: dict[str, Any]) -> str:
     ]
     spread = max(way["sd_over_seeds"]["cd"] or 0.0 for way in result["ways"].values())
     head = (
-        f"{result['data']['shapes']} test shapes, {result['views']} views, seeds "
-        f"{', '.join(map(str, result['seeds']))}; un-squared distances x100. Changes against random codes with their "
-        f"standard error over shapes; CD varies over seeds by at most {spread:.3f} (sd). Lowered: share of "
+        f"{result['shapes']} test shapes, {result['views']} views, codes and views drawn "
+        f"{result['seeds']} times; un-squared distances x100. Changes against random codes with their standard error "
+        f"over shapes; CD varies between draws by at most {spread:.3f} (sd). Lowered: share of "
         "reconstructions whose consistency loss the descent lowered. Samples of the true shape, as large as one "
         f"prediction, disagree by {result['floor']:.2f}."
     )
