@@ -67,9 +67,8 @@ def test_agreement_goes_on_where_it_was(
     with pytest.raises(KeyboardInterrupt):
         agreement(bench, smoke_run, views=2, ways=_WAYS)
     found = agreement(bench, smoke_run, views=2, ways=_WAYS)
-    assert (
-        len(scored) == 1 + len(_WAYS) + 2
-    )  # the one that was interrupted is the only one that is taken again
+    # The one that was interrupted is the only one that is taken again.
+    assert len(scored) == 1 + len(_WAYS) + 2
     assert agreement(bench, smoke_run, views=2, ways=_WAYS) == found
     assert len(scored) == 1 + len(_WAYS) + 2  # all was kept
     other = tmp_path / "other.safetensors"

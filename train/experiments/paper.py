@@ -14,12 +14,7 @@ from train.experiments.table import Claim, Row, Table, below
 from train.experiments.ten_answers import ten_answers
 from train.experiments.workbench import Change, Workbench, as_it_is
 from train.recipes import with_system
-from train.scoring import (
-    SHAPES_AT_ONCE,
-    Scores,
-    compare,
-    joined,
-)
+from train.scoring import SHAPES_AT_ONCE, Scores, compare, joined
 from train.systems import METHODS
 
 

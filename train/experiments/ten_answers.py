@@ -11,7 +11,7 @@ from torch import Tensor
 from models import Critic, Predictor, critic_loss, gradient_penalty
 from train.batches import Batch, LoadedSplit
 from train.checkpoint import load_autoencoder
-from train.config import FitConfig
+from train.config import FitConfig, StageConfig
 from train.experiments.table import Row
 from train.experiments.workbench import Workbench
 from train.metrics import visible_error
@@ -23,10 +23,11 @@ _NEAREST_AMONG = 300
 # What a critic learns from, and for how long. With a third or twice of the steps its opinions are 6 to 15 % lower or
 # higher, in the same order.
 _TAUGHT_ON, _TAUGHT_ANSWERS = 300, 4
-_STEPS, _AT_ONCE, _RATE, _PENALTY = 1500, 128, 1e-3, 10.0
+_STEPS, _AT_ONCE, _RATE = 1500, 128, 1e-3
 
 Source = Callable[[LoadedSplit, int], Iterator[tuple[Tensor, Batch, Tensor]]]
-"""(split, R) -> some shapes at a time: their numbers (B,), the view that is shown, and R answers to it (R, B, N, 3)."""
+"""(split, R) -> some shapes at a time: their numbers (B,), the view that is shown, and R answers to it (R, B, N, 3), or
+as many as there are."""
 
 
 def ten_answers(row: Row, bench: Workbench, config: FitConfig) -> Scores:
@@ -79,14 +80,13 @@ def _taken(
 
 
 def _samples(
-    split: LoadedSplit, count: int | None = None, *, points: int, seed: int
+    split: LoadedSplit, count: int, *, points: int, seed: int
 ) -> Iterator[tuple[Tensor, Batch, Tensor]]:
-    """Disjoint samples of true shapes, as large as a prediction where the data have points for two. However many are
-    asked for, there are as many as there are points for."""
+    """A `Source`: disjoint samples of true shapes, as large as a prediction where the data have points for two."""
     available = split.points.shape[1]
     size = min(points, available // 2)
     order = torch.randperm(available, generator=torch.Generator().manual_seed(seed))
-    samples = [part for part in order.split(size) if len(part) == size]
+    samples = order[: size * min(count, available // size)].split(size)
     for shapes, shown in one_view_each(split, seed):
         yield shapes, shown, torch.stack([split.points[shapes][:, sample] for sample in samples])
 
@@ -109,7 +109,7 @@ def below_real_shapes(
     encode: Callable[[Tensor], Tensor],
     points: int,
     seed: int,
-    steps: int = _STEPS,
+    steps: int,
 ) -> Scores:
     """How far a critic puts answers below real shapes, after it has learnt to tell just these from real ones.
 
@@ -120,7 +120,7 @@ def below_real_shapes(
         given: whose answers.
         test: held-out shapes, which are judged.
         taught: training shapes, from which the critic learns.
-        encode: clouds (B, N, 3) -> codes (B, D).
+        encode: clouds (B, N, 3) -> codes (B, D), of a frozen network.
         points: of a real cloud, as many as an answer has.
         seed: draws the samples of real shapes, and what the critic learns from.
         steps: for which it learns.
@@ -135,22 +135,21 @@ def below_real_shapes(
     def of_both(split: LoadedSplit, count: int) -> tuple[Tensor, Tensor]:
         """Codes (R, M, D) of samples of a split's shapes, and of answers."""
         # Another seed: where the answers are samples too, these are others of the same shapes.
-        real = [codes(clouds[:count]) for _, _, clouds in _samples(split, points=points, seed=seed + 1)]
-        fake = [codes(clouds[:count]) for _, _, clouds in given(split, count)]
+        real = [codes(clouds) for _, _, clouds in _samples(split, count, points=points, seed=seed + 1)]
+        fake = [codes(clouds) for _, _, clouds in given(split, count)]
         return torch.cat(real, 1), torch.cat(fake, 1)
 
-    with torch.no_grad():
-        lessons, questions = of_both(taught, _TAUGHT_ANSWERS), of_both(test, _ANSWERS)
+    lessons, questions = of_both(taught, _TAUGHT_ANSWERS), of_both(test, _ANSWERS)
     critic = trained_critic(*(each.flatten(0, 1) for each in lessons), seed=seed, steps=steps)
-    with torch.no_grad():
-        real, fake = (critic(each).mean(0) for each in questions)
+    real, fake = (critic(each).mean(0) for each in questions)
     return {"critic": (real - fake).double()}
 
 
 def trained_critic(real: Tensor, fake: Tensor, *, seed: int, steps: int) -> Critic:
     """A critic (WGAN-GP) that gives codes real (K, D) more than fake (L, D), with a slope of about one between them.
 
-    Its mean scores of codes that it has not met differ by more, the farther apart the two kinds are, in their unit.
+    Its mean scores of codes that it has not met differ by more, the farther apart the two kinds are, in their unit. It
+    comes back frozen.
 
     Example:
         >>> some, others = torch.randn(2, 500, 128, generator=torch.Generator().manual_seed(0))
@@ -166,8 +165,8 @@ def trained_critic(real: Tensor, fake: Tensor, *, seed: int, steps: int) -> Crit
     for _ in range(steps):
         some = [each[torch.randint(len(each), (_AT_ONCE,), generator=random)] for each in (real, fake)]
         penalty = gradient_penalty(critic, *some, mix=torch.rand(_AT_ONCE, generator=random))
-        loss = critic_loss(*map(critic, some)) + _PENALTY * penalty
+        loss = critic_loss(*map(critic, some)) + StageConfig.penalty * penalty
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
-    return critic
+    return critic.requires_grad_(False)
