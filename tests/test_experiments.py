@@ -15,7 +15,7 @@ from train.checkpoint import save_weights
 from train.config import InferenceConfig
 from train.errors import UserError
 from train.evaluate import evaluate
-from train.experiments import Workbench, run_experiment
+from train.experiments import EXPERIMENTS, Workbench, run_experiment
 from train.experiments.agreement import WAYS, agreement
 from train.scoring import Scores, score
 
@@ -87,6 +87,13 @@ def test_random_codes_are_those_of_the_evaluation(smoke_run: Path, tiny_data: Pa
 def test_the_paper_s_setting_is_among_the_ways() -> None:
     assert InferenceConfig(groups=5, steps=30, step_size=0.5) in WAYS.values()
     assert WAYS["random codes"] == InferenceConfig(groups=1, steps=0)
+
+
+@pytest.mark.parametrize("name", sorted(set(EXPERIMENTS) - {"front-vs-projection", "photos", "runtime"}))
+def test_no_data_is_said_and_nothing_written(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no data; name one or more data trees with --data"):
+        run_experiment(name, Workbench((), tmp_path, "smoke", progress=False))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("views", [1, 5])

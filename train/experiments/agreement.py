@@ -99,10 +99,10 @@ def agreement(
     test = bench.split(config, "test")
     if not 2 <= views <= test.views:
         raise UserError(
-            f"--views must be between 2 and the {test.views} that {bench.data[0]} has; got {views}"
+            f"--views must be between 2 and the {test.views} that {bench.scored_tree} has; got {views}"
         )
     if len(test) < 2:
-        raise UserError(f"one test shape has no spread; {bench.data[0]} must give at least 2")
+        raise UserError(f"one test shape has no spread; {bench.scored_tree} must give at least 2")
 
     seeds = range(bench.seeds)
     of_ways = {name: [_Asked(settings, views, seed) for seed in seeds] for name, settings in ways.items()}

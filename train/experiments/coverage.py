@@ -91,10 +91,10 @@ def coverage(bench: Workbench) -> dict[str, Any]:
     hiders = [found for found in map(hider_of, test.ids) if found]
     if not hiders:
         raise UserError(
-            f"{bench.data[0]} has no test shape of a family with hidden backs; make some with: "
+            f"{bench.scored_tree} has no test shape of a family with hidden backs; make some with: "
             "python -m train data procedural --out DIR"
         )
-    size = ShapeTree(bench.data[0], "test")[0].camera.height
+    size = ShapeTree(bench.scored_tree, "test")[0].camera.height
     objects: list[Object] = []
 
     def needed() -> list[Object]:

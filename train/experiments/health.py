@@ -99,6 +99,7 @@ def health(bench: Workbench) -> dict[str, Any]:
     Returns:
         What health.json holds.
     """
+    bench.need_data()
     curves: dict[str, dict[str, list[list[dict[str, float]]]]] = {}
     trainings = _trainings(bench)
     missing = [training for training in trainings if not _kept_at(bench, *training).exists()]

@@ -102,8 +102,7 @@ def _sum(costs: Iterable[float | None]) -> float | None:
 
 def _with_data(bench: Workbench) -> Workbench:
     trees = bench.on_trees()
-    if not bench.data:
-        raise UserError("no data; name one or more data trees with --data")
+    bench.need_data()
     if not trees.data:
         raise UserError(
             f"no data tree among --data {' '.join(map(str, bench.data))}; make one with: "

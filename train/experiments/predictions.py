@@ -146,7 +146,7 @@ def _markdown(result: Mapping[str, Any]) -> str:
 def _figure(bench: Workbench) -> Figure:
     config = bench.config(as_it_is, seed=0)
     model = _generator(bench, config)
-    tree = ShapeTree(bench.data[0], "test", list(config.categories) or None)
+    tree = ShapeTree(bench.scored_tree, "test", list(config.categories) or None)
     examples = [
         make_example(model, shape, config, seed=0, codes=SHOWN_CODES)
         for shape in pick_shapes(tree, SHOWN_SHAPES)

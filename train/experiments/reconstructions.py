@@ -141,7 +141,7 @@ def _figure(
     figure, panels = figures.grid(rows=2 * len(truth), columns=3 + len(clouds))
     for row, (name, errors) in enumerate(result["shapes"].items()):
         upper, lower = pair = panels[2 * row : 2 * row + 2]
-        shape = read_shape(bench.data[0], name)
+        shape = read_shape(bench.scored_tree, name)
         images, cameras = figures.close_up(shape.images, shape.camera, shape.points)
         first = cameras[int(views[row, 0])]
         for axes in pair[:, :2].flat:

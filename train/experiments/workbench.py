@@ -121,10 +121,20 @@ class Workbench:
         key = _digest(json.dumps([values, self.fingerprints()], sort_keys=True))
         return self.out / "runs" / f"{key}-seed{config.seed}"
 
-    def fingerprints(self) -> list[str]:
-        """Of each data tree: changes when its lists, or what it was made with, change."""
+    def need_data(self) -> None:
+        """Raises a UserError if there are no data."""
         if not self.data:
             raise UserError("no data; name one or more data trees with --data")
+
+    @property
+    def scored_tree(self) -> Path:
+        """The first data tree, whose test shapes are scored."""
+        self.need_data()
+        return self.data[0]
+
+    def fingerprints(self) -> list[str]:
+        """Of each data tree: changes when its lists, or what it was made with, change."""
+        self.need_data()
         return [_tree_fingerprint(root) for root in self.data]
 
     def is_trained(self, config: FitConfig) -> bool:
@@ -325,10 +335,10 @@ class Workbench:
         the shapes that are scored, or at most `limit` of its shapes."""
         size = image_size(config)
         limit = limit or (self.limit if split != "train" else None)
-        key = (self.data[:1], limit, split, *size, config.map_size, config.gt_pool, config.categories)
+        key = (self.scored_tree, limit, split, *size, config.map_size, config.gt_pool, config.categories)
         if key not in self._loaded:
             self._loaded[key] = read_split(
-                config, self.data[0], split, image_size=size, limit=limit, progress=self.progress
+                config, self.scored_tree, split, image_size=size, limit=limit, progress=self.progress
             )
         return self._loaded[key]
 

@@ -61,7 +61,7 @@ def one_armed(bench: Workbench) -> dict[str, Any]:
     """
     _check(bench)
     bench.train_all(configs(bench))
-    size = ShapeTree(bench.data[0], "test")[0].camera.height
+    size = ShapeTree(bench.scored_tree, "test")[0].camera.height
     number = min(CHAIRS, bench.limit or CHAIRS)
     chairs: list[OneArmedChair] = []
 
@@ -108,6 +108,7 @@ def presence(clouds: Tensor, boxes: Tensor, shares: Tensor) -> Tensor:
 
 def _check(bench: Workbench) -> None:
     """Chairs have to be in the training data, and these ones must not."""
+    bench.need_data()
     trained = [shape for root in bench.data for shape in ShapeTree(root, "train").ids]
     if not any(shape.startswith(SYNSET_OF["chair"]) for shape in trained):
         raise UserError(
