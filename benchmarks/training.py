@@ -21,9 +21,9 @@ from benchmarks.inputs import surfaces
 from benchmarks.peers import optional
 from diffpoint import reference
 from models import PROFILES as SIZES
-from train.batches import LoadedSplit
 from train.config import PROFILES, FitConfig, StageConfig
-from train.state import Training
+from train.data.batches import LoadedSplit
+from train.training.state import Training
 
 _SHAPES, _VIEWS = 16, 8
 _STEPS = {"smoke": (5, 10), "cpu": (5, 8), "full": (1, 2)}
@@ -58,7 +58,7 @@ def measure(*, quick: bool = False) -> Iterator[dict[str, Any]]:
 
 def _shares(training: Training, warm: int, steps: int) -> dict[str, Any]:
     """Median milliseconds of a step, and the shares of its parts."""
-    from train import objective
+    from train.methods import losses as objective
 
     for _ in range(warm):
         training.advance()
@@ -127,7 +127,8 @@ def twins(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
         assign: instead of the twin's own search for the best assignment, which takes a second a pair.
     """
     from diffpoint import losses
-    from train import objective, step
+    from train.methods import losses as objective
+    from train.methods import step
 
     def visible_points(points: Tensor, camera: dp.PinholeCamera, **_: Any) -> Tensor:
         return reference.splat_depth(points, camera.K, camera.cam_from_world, camera.height, camera.width)[2]

@@ -23,7 +23,7 @@ import torch
 from train.experiments.front_vs_projection.free_clouds import LOSSES, Fit, fit_cloud
 from train.experiments.front_vs_projection.page import DRAWN, ONE, clouds
 from train.experiments.front_vs_projection.shapes import Cameras, embedded_shape
-from train.figures import save
+from train.show.figures import save
 
 SHAPES = ("chair", "table", "sofa")
 CAMERAS = (ONE, Cameras(8))

@@ -10,10 +10,10 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from train.batches import load_split
 from train.config import PROFILES, FitConfig, StageConfig
-from train.parallel import World, gather
-from train.state import Training
+from train.data.batches import load_split
+from train.distributed import World, gather
+from train.training.state import Training
 
 _SMOKE = PROFILES["smoke"]
 _Gradients = dict[str, torch.Tensor]

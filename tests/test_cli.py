@@ -16,10 +16,10 @@ from PIL import Image
 
 from train.__main__ import main
 from train.config import fit_config_from_json
+from train.data.images import is_cut_out, read_images
 from train.data.procedural import generate
 from train.errors import UserError
-from train.images import is_cut_out, read_images
-from train.runs import open_run
+from train.evaluation.runs import open_run
 
 
 @pytest.fixture
@@ -131,7 +131,7 @@ def test_reconstruct_writes_a_cloud_and_a_page(smoke_run: Path, picture: Path, t
 def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the weights that come with the repository are looked for; nothing is there yet."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("train.runs._SHIPPED", tmp_path / "shipped")
+    monkeypatch.setattr("train.evaluation.runs._SHIPPED", tmp_path / "shipped")
     return tmp_path / "shipped" / "generator.safetensors"
 
 

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from diffpoint.io import read_points, write_points
-from train.batches import LoadedSplit, Sampler, load_split
 from train.data import ShapeTree, store
+from train.data.batches import LoadedSplit, Sampler, load_split
 from train.data.cache import prepare
 from train.data.shrink import Sizes, SmallShape, shrink
 from train.data.tree import _found_frame, read_shape

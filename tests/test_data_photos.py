@@ -18,9 +18,9 @@ from PIL import Image
 from train.__main__ import main
 from train.data.cutout import FILL, cut_out
 from train.data.foreground import NotPlain, find_foreground
+from train.data.images import read_rgba
 from train.data.photos import convert_photos, find_photos
 from train.errors import UserError
-from train.images import read_rgba
 
 WHITE, CREAM, BLUE = (0.95, 0.95, 0.94), (0.93, 0.9, 0.82), (0.75, 0.82, 0.9)
 

@@ -6,8 +6,8 @@ from PIL import Image
 
 from train.__main__ import main
 from train.data import ShapeTree, store
+from train.data.contact_sheet import _arranged, show, strip_of
 from train.data.procedural import generate
-from train.data.show import _arranged, show, strip_of
 from train.errors import UserError
 
 

@@ -13,10 +13,10 @@ from PIL import Image
 
 from diffpoint import PinholeCamera
 from train.data.rules import Hider
-from train.experiments import Workbench
 from train.experiments.correlation import correlation, over_shapes, pearson, spearman, within_shapes
 from train.experiments.coverage import coverage, hidden_distances, make_object, near_distance, reach
 from train.experiments.predictions import predictions, spread
+from train.experiments.run import Workbench
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ import pytest
 
 from train.config import FitConfig
 from train.errors import UserError
-from train.experiments import EXPERIMENTS, Workbench, write_page
 from train.experiments.ledger import Experiment, answer, answer_all, is_done, list_lines, overview
 from train.experiments.paper import TABLES, deterministic, second_stage_without_diversity, without_critic
+from train.experiments.registry import ABOUT_ALL, QUESTIONS
+from train.experiments.run import EXPERIMENTS, Workbench, write_page
 from train.experiments.table import markdown
 from train.experiments.workbench import stage1_of
-from train.questions import ABOUT_ALL, QUESTIONS
 
 
 def _shared(bench: Workbench) -> list[FitConfig]:

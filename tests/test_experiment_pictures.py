@@ -15,12 +15,13 @@ import torch
 from PIL import Image
 
 from tests.photographs import as_jpeg, surface_for, take
-from train import figures
 from train.data.families.chair import CHAIR
 from train.data.photos import convert_photos
 from train.data.procedural import generate
 from train.data.solids import Solid
 from train.errors import UserError
+from train.evaluation.metrics import cloud_errors
+from train.evaluation.per_shape import view_order
 from train.experiments.one_armed.chairs import (
     HIDDEN,
     SEED,
@@ -37,9 +38,8 @@ from train.experiments.page import write_page
 from train.experiments.photos import photos, read_objects
 from train.experiments.reconstructions import picked, reconstructions
 from train.experiments.workbench import Workbench
-from train.metrics import cloud_errors
-from train.recipes import with_system
-from train.scoring import view_order
+from train.methods.recipes import with_system
+from train.show import figures
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from PIL import Image
 from diffpoint import PinholeCamera
 from train.data.embree import has_embree
 from train.data.solids import box, sample_union, surface_of
-from train.experiments import Workbench
 from train.experiments.hidden_points import Rays, Scene, embedded_scene, make_scene, quality
+from train.experiments.run import Workbench
 from train.experiments.runtime import medians, runtime
 
 needs_embree = pytest.mark.skipif(not has_embree(), reason="embreex has no wheel here")

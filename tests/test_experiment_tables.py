@@ -15,12 +15,12 @@ from torch import Tensor
 
 from models import build_generator
 from models.parts import prepare_images
-from train.batches import Batch, LoadedSplit
-from train.checkpoint import best_weights, load_autoencoder
 from train.config import FitConfig, scaled
+from train.data.batches import Batch, LoadedSplit
 from train.errors import UserError
-from train.experiments import EXPERIMENTS, Workbench, run_experiment
-from train.experiments.health import VARIANTS
+from train.evaluation.per_shape import one_view_each
+from train.evaluation.runs import best_weights, load_autoencoder, read_metrics
+from train.experiments.collapse import VARIANTS
 from train.experiments.ledger import overview
 from train.experiments.paper import (
     DETERMINISTIC,
@@ -32,11 +32,10 @@ from train.experiments.paper import (
     with_critic,
     without_critic,
 )
+from train.experiments.run import EXPERIMENTS, Workbench, run_experiment
 from train.experiments.table import Row, Table, below, confidence, make, markdown, measured
 from train.experiments.ten_answers import below_real_shapes
 from train.experiments.workbench import parts_of, stage1_of
-from train.log import read_metrics
-from train.scoring import one_view_each
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,13 @@ import torch
 from PIL import Image
 
 from models import build_generator
-from train.checkpoint import save_weights
 from train.config import InferenceConfig
 from train.errors import UserError
-from train.evaluate import evaluate
-from train.experiments import EXPERIMENTS, Workbench, run_experiment
+from train.evaluation.evaluate import evaluate
+from train.evaluation.per_shape import Scores, score
 from train.experiments.agreement import WAYS, agreement
-from train.scoring import Scores, score
+from train.experiments.run import EXPERIMENTS, Workbench, run_experiment
+from train.methods.weights import save_weights
 
 _WAYS = {
     "random codes": InferenceConfig(groups=1, steps=0),

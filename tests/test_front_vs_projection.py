@@ -14,11 +14,11 @@ from PIL import Image
 from diffpoint import chamfer_distance, unproject
 from train.__main__ import main
 from train.errors import UserError
+from train.evaluation.metrics import in_silhouette
 from train.experiments.front_vs_projection import networks_page, page
 from train.experiments.front_vs_projection.free_clouds import LOSSES, fit_cloud
 from train.experiments.front_vs_projection.shapes import Cameras, embedded_shape, shapes_of
 from train.experiments.front_vs_projection.study import run
-from train.metrics import in_silhouette
 
 ONE, TWO, SPHERE = Cameras(1), Cameras(2), Cameras(6, sphere=True)
 

@@ -16,13 +16,13 @@ from models.parts import PointDecoder
 from models.sizes import PROFILES as SIZES
 from train.config import PROFILES
 from train.errors import UserError
-from train.experiments import Workbench
+from train.evaluation.metrics import in_silhouette, visible_error
 from train.experiments.front_vs_projection.free_clouds import LOSSES
 from train.experiments.front_vs_projection.networks import TAUGHT, configs, densities, verdict
 from train.experiments.front_vs_projection.study import front_vs_projection
-from train.metrics import in_silhouette, visible_error
-from train.objective import Scene, supervise
-from train.systems import build_network
+from train.experiments.run import Workbench
+from train.methods.losses import Scene, supervise
+from train.methods.systems import build_network
 
 INFINITY = float("inf")
 

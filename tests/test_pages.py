@@ -15,8 +15,8 @@ import torch
 from matplotlib.figure import Figure
 
 from diffpoint import PinholeCamera, project
-from train import figures, pages
-from train.pages import write_reconstruction_page
+from train.show import figures, pages
+from train.show.pages import write_reconstruction_page
 
 LOADED_FROM_ELSEWHERE = re.compile(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""")
 

@@ -14,13 +14,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from train.checkpoint import load_generator
 from train.config import PROFILES
 from train.data import ShapeTree
 from train.demo import DEMO_CONFIG, demo
 from train.errors import UserError
-from train.log import read_metrics
-from train.report import make_example, write_report
+from train.evaluation.report import make_example, write_report
+from train.evaluation.runs import load_generator, read_metrics
 
 _SMOKE = PROFILES["smoke"]
 

@@ -11,14 +11,14 @@ import torch
 from models import PROFILES as SIZES
 from models import Autoencoder, AutoencoderConfig, build_autoencoder, build_generator
 from models.autoencoder import AUTOENCODER_PROFILES
-from train.batches import load_split
-from train.checkpoint import best_weights, load_autoencoder, load_generator, save_weights
 from train.config import PROFILES
+from train.data.batches import load_split
 from train.errors import UserError
-from train.fit import fit
-from train.log import read_metrics
-from train.state import Training
-from train.step import autoencoder_step
+from train.evaluation.runs import best_weights, load_autoencoder, load_generator, read_metrics
+from train.methods.step import autoencoder_step
+from train.methods.weights import save_weights
+from train.training.state import Training
+from train.training.trainer import fit
 
 _SMOKE = PROFILES["smoke"]
 

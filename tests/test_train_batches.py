@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from diffpoint import PinholeCamera, unproject
-from train.batches import Sampler, load_split
+from train.data.batches import Sampler, load_split
 from train.data.procedural import generate
 from train.data.shrink import decimate_depth, min_pool_depth
 from train.errors import UserError

@@ -10,9 +10,11 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from models import build_generator
-from train.checkpoint import load_generator, load_networks, load_state, save_checkpoint, save_weights
 from train.errors import UserError
+from train.evaluation.runs import load_generator
 from train.files import replacing
+from train.methods.weights import save_weights
+from train.training.checkpoint import load_networks, load_state, save_checkpoint
 
 
 @pytest.mark.parametrize("deterministic", [False, True])

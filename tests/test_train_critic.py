@@ -17,10 +17,10 @@ from models import (
     generator_loss,
     gradient_penalty,
 )
-from train.batches import Batch, load_split
 from train.config import PROFILES
-from train.state import Training
-from train.step import Learner, critic_steps
+from train.data.batches import Batch, load_split
+from train.methods.step import Learner, critic_steps
+from train.training.state import Training
 
 _SMOKE = PROFILES["smoke"]
 

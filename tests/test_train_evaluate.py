@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from models import build_generator
-from train.batches import load_split
-from train.checkpoint import save_weights
+from train.data.batches import load_split
 from train.errors import UserError
-from train.evaluate import evaluate
-from train.figures import errors_figure
-from train.metrics import cloud_errors, thin_out, transport_error
-from train.scoring import FIGURES
-from train.table import format_table
-from train.trivial import medoid, nearest_by_image
+from train.evaluation.evaluate import evaluate
+from train.evaluation.metrics import cloud_errors, thin_out, transport_error
+from train.evaluation.per_shape import FIGURES
+from train.evaluation.retrieval import medoid, nearest_by_image
+from train.methods.weights import save_weights
+from train.show.figures import errors_figure
+from train.show.table import format_table
 
 
 def _lattice() -> torch.Tensor:

@@ -18,16 +18,15 @@ from typing import Any
 import pytest
 import torch
 
-from train import state as state_module
 from train.__main__ import main
-from train.batches import load_split
-from train.checkpoint import best_weights, latest_checkpoint, load_generator
 from train.config import PROFILES, Precision, fit_config_from_json
+from train.data.batches import load_split
 from train.errors import UserError
-from train.fit import fit
-from train.log import read_metrics
-from train.state import Training
-from train.step import training_step
+from train.evaluation.runs import best_weights, latest_checkpoint, load_generator, read_metrics
+from train.methods.step import training_step
+from train.training import state as state_module
+from train.training.state import Training
+from train.training.trainer import fit
 
 _SMOKE = PROFILES["smoke"]
 

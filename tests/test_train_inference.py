@@ -10,7 +10,7 @@ import torch
 from diffpoint import consistency_loss
 from models import Generator, build_generator
 from train.config import InferenceConfig
-from train.inference import reconstruct
+from train.evaluation.inference import reconstruct
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_parts_of_a_batch_make_the_whole(
 ) -> None:
     stopping = InferenceConfig(groups=2, steps=5, step_size=1.0, patience=1, min_drop=0.05)
     whole = reconstruct(model, images, settings=stopping)
-    monkeypatch.setattr("train.inference._POINTS_AT_ONCE", 1)
+    monkeypatch.setattr("train.evaluation.inference._POINTS_AT_ONCE", 1)
     in_parts = reconstruct(model, images, settings=stopping)
     assert torch.equal(whole.kept, in_parts.kept)
     assert len(set(whole.kept.tolist())) == 2, "the parts are meant to stop at different steps"

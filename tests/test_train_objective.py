@@ -22,7 +22,7 @@ from train.config import (
     with_variant,
 )
 from train.errors import UserError
-from train.objective import Scene, arrange_scenes, front_loss, spread_loss
+from train.methods.losses import Scene, arrange_scenes, front_loss, spread_loss
 
 
 def _cameras(shapes: int, views: int, size: int) -> PinholeCamera:

@@ -11,9 +11,8 @@ import pytest
 import torch
 
 from tests.one_step_each import one_step_each
-from train.checkpoint import latest_checkpoint, load_generator
-from train.log import read_metrics
-from train.parallel import ALONE, gather
+from train.distributed import ALONE, gather
+from train.evaluation.runs import latest_checkpoint, load_generator, read_metrics
 
 _ROOT = Path(__file__).parents[1]
 

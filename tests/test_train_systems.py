@@ -15,22 +15,21 @@ from diffpoint.io import read_points
 from models import PROFILES as SIZES
 from models import Generator
 from models.baselines import Baseline, StructureGenerator, fixed_cameras, surface_points
-from train import state as state_module
 from train.__main__ import main
-from train.batches import LoadedSplit, Truth, load_split
-from train.checkpoint import config_of, latest_checkpoint, load_generator, load_predictor
 from train.config import PROFILES, StageConfig, System, fit_config_from_json, to_json, with_steps
+from train.data.batches import LoadedSplit, Truth, load_split
 from train.errors import UserError
-from train.evaluate import evaluate
-from train.fit import fit
-from train.inference import reconstruct
-from train.lessons import Given
-from train.log import read_metrics
-from train.recipes import with_system
-from train.scoring import compare, score
-from train.state import Training
-from train.systems import METHODS, build_network, cloud_size, image_size, system_of, taught_step
-from train.truth import fixed_depth, hull_cells, solid_cells
+from train.evaluation.evaluate import evaluate
+from train.evaluation.inference import reconstruct
+from train.evaluation.per_shape import compare, score
+from train.evaluation.runs import config_of, latest_checkpoint, load_generator, load_predictor, read_metrics
+from train.methods.lessons import Given
+from train.methods.recipes import with_system
+from train.methods.systems import METHODS, build_network, cloud_size, image_size, system_of, taught_step
+from train.methods.targets import fixed_depth, hull_cells, solid_cells
+from train.training import state as state_module
+from train.training.state import Training
+from train.training.trainer import fit
 
 _SMOKE = PROFILES["smoke"]
 _OTHERS = [system for system in get_args(System) if system != "ours"]

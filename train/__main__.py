@@ -23,8 +23,8 @@ from tyro.constructors import PrimitiveConstructorSpec
 from train.config import PROFILES, FitConfig, System, fit_config_from_json, with_steps, with_variant
 from train.data_commands import Data
 from train.errors import UserError
-from train.questions import ABOUT_ALL, QUESTIONS
-from train.recipes import with_system
+from train.experiments.registry import ABOUT_ALL, QUESTIONS
+from train.methods.recipes import with_system
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
 
@@ -65,8 +65,8 @@ class Fit:
     """The same number of steps for every phase, ramps in proportion, for a quick trial."""
 
     def run(self) -> int:
-        from train.fit import fit
-        from train.parallel import gather
+        from train.distributed import gather
+        from train.training.trainer import fit
 
         config = self.config
         if self.steps is not None:
@@ -106,7 +106,7 @@ class Reconstruct:
     """Draws the codes."""
 
     def run(self) -> None:
-        from train.reconstruction import reconstruct_to_files
+        from train.evaluation.reconstruct import reconstruct_to_files
 
         reconstruct_to_files(
             self.model, self.images, self.out, groups=self.groups, steps=self.steps, seed=self.seed
@@ -137,7 +137,7 @@ class Evaluate:
     """Where to write; RUN/evaluation.json if not given."""
 
     def run(self) -> None:
-        from train.evaluate import evaluate
+        from train.evaluation.evaluate import evaluate
 
         evaluate(
             self.model,
@@ -203,7 +203,7 @@ class Experiment:
     """agreement: views per shape."""
 
     def run(self) -> None:
-        from train.experiments import Workbench, run_all, run_experiment, show_all, write_page
+        from train.experiments.run import Workbench, run_all, run_experiment, show_all, write_page
 
         processes = os.cpu_count() or 1 if self.processes is None else self.processes
         bench = Workbench(

@@ -148,7 +148,7 @@ class Show:
     """Shapes on a sheet, evenly spread over the category."""
 
     def run(self) -> None:
-        from train.data.show import show
+        from train.data.contact_sheet import show
 
         for category, path in show(
             self.data, self.out, categories=self.categories or None, shapes=self.shapes

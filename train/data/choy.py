@@ -23,10 +23,10 @@ from torch import Tensor
 
 from diffpoint.camera import PinholeCamera
 from train.data import store
+from train.data.images import on_white
 from train.data.release import CLOUD_FOLDERS, listed
 from train.data.shape import ShapeError, ViewsRead, make_camera, read_file, read_pixels
 from train.errors import UserError
-from train.images import on_white
 
 NAME = "ShapeNetRendering"
 MAX_DISTANCE = 1.75

@@ -23,10 +23,10 @@ from PIL import Image
 
 from train.data import store
 from train.data.cutout import cut_out
+from train.data.images import read_rgba
 from train.data.work import run_all
 from train.errors import UserError
 from train.files import replacing, write_text
-from train.images import read_rgba
 
 MASKS = "masks"
 

@@ -19,9 +19,9 @@ from torch import Tensor
 from diffpoint.camera import PinholeCamera
 from diffpoint.io import read_depth
 from train.data import store
+from train.data.images import on_white
 from train.data.shape import ShapeError, ViewsRead, make_camera, read_file, read_pixels
 from train.errors import UserError
-from train.images import on_white
 
 CLOUD_FOLDERS = (store.CLOUDS, "shape_net_core_uniform_samples_2048")
 """Names of the folder with the clouds; the second is that of the archive in which ShapeNet's are distributed."""

@@ -24,15 +24,15 @@ from tqdm import tqdm
 
 from diffpoint import consistency_loss
 from models import Generator
-from train import figures
-from train.batches import LoadedSplit
 from train.config import InferenceConfig
+from train.data.batches import LoadedSplit
 from train.errors import UserError
+from train.evaluation.per_shape import Scores, joined, means, score, spreads, stacked
+from train.evaluation.runs import open_run
 from train.experiments.correlation import pearson
 from train.experiments.table import table_row
 from train.experiments.workbench import Workbench
-from train.runs import open_run
-from train.scoring import Scores, joined, means, score, spreads, stacked
+from train.show import figures
 
 _RANDOM = "random codes"
 WAYS: dict[str, InferenceConfig] = {

@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 from scipy.stats import rankdata
 from torch import Tensor
 
-from train import figures
 from train.config import InferenceConfig
+from train.evaluation.per_shape import Scores, stacked
 from train.experiments.table import NAMES, table_lines, trainings, verdict
 from train.experiments.workbench import Workbench, as_it_is
-from train.scoring import Scores, stacked
+from train.show import figures
 
 VIEWS = 8
 GROUPS = 20

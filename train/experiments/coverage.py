@@ -19,7 +19,6 @@ from tqdm import tqdm
 
 from diffpoint import PinholeCamera, nearest
 from models import Predictor
-from train import figures
 from train.config import FitConfig
 from train.data import ShapeTree, store
 from train.data.families import FAMILIES
@@ -28,10 +27,11 @@ from train.data.render import Renderer, orbit_camera
 from train.data.rules import Hider, hider_of
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
+from train.evaluation.per_shape import Scores, stacked
 from train.experiments.paper import deterministic, highly_diverse
 from train.experiments.table import claim_lines, judged, mean_and_spread, table_lines, trainings
 from train.experiments.workbench import Change, Workbench, as_it_is
-from train.scoring import Scores, stacked
+from train.show import figures
 
 CODES = (10, 50)
 APART = 0.04

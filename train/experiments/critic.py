@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from train import figures
 from train.config import FitConfig
+from train.evaluation.per_shape import Scores
+from train.evaluation.runs import read_metrics
 from train.experiments.paper import CRITIC, with_critic
 from train.experiments.table import figure, markdown, tabulate, trainings
 from train.experiments.workbench import Workbench
-from train.log import read_metrics
-from train.scoring import Scores
+from train.show import figures
 
 _PARTS = 10
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from train.errors import UserError
+from train.experiments.registry import QUESTIONS
 from train.experiments.table import claim_cells, table_row
 from train.files import write_text
-from train.questions import QUESTIONS
 
 
 def write_page(out: Path) -> Path:

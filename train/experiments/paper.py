@@ -8,14 +8,14 @@ import functools
 import torch
 
 from models import Predictor
-from train.batches import LoadedSplit
 from train.config import FitConfig, System, with_variant
+from train.data.batches import LoadedSplit
+from train.evaluation.per_shape import SHAPES_AT_ONCE, Scores, compare, joined
 from train.experiments.table import Claim, Row, Table, below
 from train.experiments.ten_answers import ten_answers
 from train.experiments.workbench import Change, Workbench, as_it_is
-from train.recipes import with_system
-from train.scoring import SHAPES_AT_ONCE, Scores, compare, joined
-from train.systems import METHODS
+from train.methods.recipes import with_system
+from train.methods.systems import METHODS
 
 
 def deterministic(config: FitConfig) -> FitConfig:

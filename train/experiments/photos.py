@@ -16,18 +16,18 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from train import figures
 from train.config import FitConfig
 from train.data.cutout import cut_out
+from train.data.images import is_cut_out, read_rgba
 from train.data.photos import Photo, find_photos
 from train.data.render import orbit_camera
 from train.errors import UserError
+from train.evaluation.inference import reconstruct
+from train.evaluation.per_shape import Scores
+from train.evaluation.reconstruct import MOST_IMAGES, read_pictures
 from train.experiments.table import table_lines, trainings
 from train.experiments.workbench import Workbench, as_it_is
-from train.images import is_cut_out, read_rgba
-from train.inference import reconstruct
-from train.reconstruction import MOST_IMAGES, read_pictures
-from train.scoring import Scores
+from train.show import figures
 
 OBJECTS = 8
 CODES = 3

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, nearest, visible_points
 from models import Generator
-from train import figures
-from train.batches import LoadedSplit
 from train.data import ShapeTree
+from train.data.batches import LoadedSplit
 from train.errors import UserError
+from train.evaluation.per_shape import Scores, answers, joined, stacked
+from train.evaluation.report import make_example, pick_shapes
 from train.experiments.table import judged, table_lines, trainings
 from train.experiments.workbench import Workbench, as_it_is
-from train.report import make_example, pick_shapes
-from train.scoring import Scores, answers, joined, stacked
+from train.show import figures
 
 CODES = 6
 SHOWN_CODES, SHOWN_SHAPES = 5, 6

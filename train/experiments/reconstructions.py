@@ -10,16 +10,16 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from train import figures
-from train.batches import LoadedSplit
 from train.config import FitConfig
+from train.data.batches import LoadedSplit
 from train.data.tree import read_shape
+from train.evaluation.inference import reconstruct
+from train.evaluation.metrics import cloud_errors, thin_out
+from train.evaluation.per_shape import Scores, view_order
 from train.experiments.paper import of_system
 from train.experiments.table import table_lines
 from train.experiments.workbench import Change, Workbench, as_it_is
-from train.inference import reconstruct
-from train.metrics import cloud_errors, thin_out
-from train.scoring import Scores, view_order
+from train.show import figures
 
 VIEWS = 8
 """Images of a shape, where the data have as many."""

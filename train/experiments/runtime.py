@@ -21,13 +21,13 @@ from tqdm import tqdm
 
 from diffpoint import runtime_info, sample_view, splat_depth, visible_points
 from diffpoint.visibility import Method
-from train import figures
 from train.data.families import FAMILIES
 from train.data.render import Orbit
 from train.experiments.hidden_points import EPSILON, VIEWS, Scene, embedded_scene, quality
 from train.experiments.table import claim_lines, judged, table_lines
 from train.experiments.workbench import Workbench
 from train.files import kept
+from train.show import figures
 
 PAPER = {
     2048: {"hidden": 0.104, "zbuffer": 6.6, "triangulation": 209.8},

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 import diffpoint
 from train.errors import UserError
-from train.interrupts import StopRequest
+from train.processes import StopRequest
 
 
 def run_side_by_side(

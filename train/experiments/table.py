@@ -15,10 +15,10 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from train import figures
 from train.config import FitConfig, InferenceConfig, scaled
+from train.evaluation.per_shape import Scores, stacked
 from train.experiments.workbench import Change, Workbench, as_it_is, stage1_of
-from train.scoring import Scores, stacked
+from train.show import figures
 
 NAMES = {
     "gt_to_pred": "GT->pred",

@@ -9,14 +9,21 @@ import torch
 from torch import Tensor
 
 from models import Critic, Predictor, critic_loss, gradient_penalty
-from train.batches import Batch, LoadedSplit
-from train.checkpoint import load_autoencoder
 from train.config import FitConfig, StageConfig
+from train.data.batches import Batch, LoadedSplit
+from train.evaluation.metrics import visible_error
+from train.evaluation.per_shape import (
+    Scores,
+    answers,
+    distance_between,
+    distance_to_nearest,
+    joined,
+    one_view_each,
+)
+from train.evaluation.runs import load_autoencoder
 from train.experiments.table import Row
 from train.experiments.workbench import Workbench
-from train.metrics import visible_error
-from train.scoring import Scores, answers, distance_between, distance_to_nearest, joined, one_view_each
-from train.systems import cloud_size
+from train.methods.systems import cloud_size
 
 _ANSWERS = 10
 _NEAREST_AMONG = 300

@@ -22,18 +22,17 @@ import torch
 from safetensors.torch import load, save
 
 from models import Predictor
-from train import figures
-from train.batches import LoadedSplit
-from train.checkpoint import best_weights, load_predictor
 from train.config import PROFILES, FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
+from train.data.batches import LoadedSplit
 from train.errors import UserError
+from train.evaluation.per_shape import SHAPES_AT_ONCE, Scores, compare, joined, score
+from train.evaluation.retrieval import medoid, nearest_by_image
+from train.evaluation.runs import best_weights, load_predictor, read_split
 from train.experiments.side_by_side import run_side_by_side
 from train.files import replacing, write_text
-from train.fit import fit
-from train.runs import read_split
-from train.scoring import SHAPES_AT_ONCE, Scores, compare, joined, score
-from train.systems import build_network, cloud_size, image_size
-from train.trivial import medoid, nearest_by_image
+from train.methods.systems import build_network, cloud_size, image_size
+from train.show import figures
+from train.training.trainer import fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

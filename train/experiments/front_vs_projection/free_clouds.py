@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from diffpoint import chamfer_distance, front_constraint, projection_loss, soft_projection_loss
+from train.evaluation.metrics import in_silhouette, visible_error
 from train.experiments.front_vs_projection.shapes import Scene
-from train.metrics import in_silhouette, visible_error
 
 MEASURED_EVERY = 10
 

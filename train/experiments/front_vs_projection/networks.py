@@ -12,15 +12,15 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, farthest_point_sample, nearest, visible_points
 from models import Predictor
-from train.batches import Batch, LoadedSplit
 from train.config import FitConfig, InferenceConfig, StageConfig, Supervision, fit_config_from_json
+from train.data.batches import Batch, LoadedSplit
+from train.evaluation.metrics import cloud_errors, in_silhouette, visible_error
+from train.evaluation.per_shape import Scores, answers, joined, one_view_each
+from train.evaluation.runs import read_metrics
 from train.experiments.workbench import Workbench
-from train.fit import STAGES
-from train.log import read_metrics
-from train.metrics import cloud_errors, in_silhouette, visible_error
-from train.scoring import Scores, answers, joined, one_view_each
-from train.systems import size_of
-from train.validation import validate
+from train.methods.systems import size_of
+from train.training.trainer import STAGES
+from train.training.validation import validate
 
 Verdict = Literal["converged", "in between", "did not converge"]
 

@@ -12,9 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from diffpoint import PinholeCamera
-from train import figures
 from train.experiments.front_vs_projection.networks import TAUGHT, Examples
 from train.experiments.table import mean_and_spread, table_row, trainings
+from train.show import figures
 
 _FLOOR = "points of the true surface"
 _SINGLE = {

@@ -15,11 +15,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from train import figures
+from train.evaluation.metrics import in_silhouette
 from train.experiments.front_vs_projection.free_clouds import LOSSES, MEASURED_EVERY, Fit, fit_cloud
 from train.experiments.front_vs_projection.shapes import Cameras, Scene, StudyShape
 from train.files import replacing
-from train.metrics import in_silhouette
+from train.show import figures
 
 MEASURES = {
     "visible_cd": "visible part, chamfer x100",

@@ -21,7 +21,6 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from train import figures
 from train.errors import UserError
 from train.experiments.front_vs_projection import networks_page, page
 from train.experiments.front_vs_projection.free_clouds import LOSSES, Fit, fit_cloud
@@ -36,6 +35,7 @@ from train.experiments.front_vs_projection.shapes import (
 )
 from train.experiments.workbench import Workbench
 from train.files import kept, write_text
+from train.show import figures
 
 SETTINGS = tuple(Cameras(n) for n in (1, 2, 4, 8)) + tuple(Cameras(n, sphere=True) for n in (8, 24))
 RATES = (0.003, 0.01, 0.03)

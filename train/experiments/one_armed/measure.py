@@ -21,14 +21,14 @@ from train.data import ShapeTree
 from train.data.categories import SYNSET_OF
 from train.data.rules import hider_of
 from train.errors import UserError
+from train.evaluation.inference import reconstruct
+from train.evaluation.metrics import cloud_errors
+from train.evaluation.per_shape import Scores, stacked
 from train.experiments.one_armed.chairs import RULES, SEED, Arms, OneArmedChair, one_armed_chairs
 from train.experiments.one_armed.page import CODED, COLUMNS, DRAWN, PLAIN, PSGN, ROWS, TWO, figure, page
 from train.experiments.paper import deterministic, of_system
 from train.experiments.table import judged
 from train.experiments.workbench import Change, Workbench, as_it_is
-from train.inference import reconstruct
-from train.metrics import cloud_errors
-from train.scoring import Scores, stacked
 
 CHAIRS = 20
 CODES = 10

@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from diffpoint import PinholeCamera, project
-from train import figures
 from train.data.render import orbit_camera
+from train.evaluation.per_shape import Scores
 from train.experiments.one_armed.chairs import SEED, make_chair
 from train.experiments.table import claim_lines, mean_and_spread, table_lines, trainings
-from train.scoring import Scores
+from train.show import figures
 
 ROWS = PLAIN, _, PSGN, _, CODED, TWO, TRUTH = (
     "deterministic, A",

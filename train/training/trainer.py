@@ -16,19 +16,20 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from train.batches import LoadedSplit
-from train.checkpoint import best_weights, latest_checkpoint, load_autoencoder, save_checkpoint, save_weights
 from train.config import FitConfig, fit_config_from_json, to_json
+from train.data.batches import LoadedSplit
 from train.data.tree import require_depth
+from train.distributed import World, gather
 from train.errors import UserError
+from train.evaluation.runs import best_weights, latest_checkpoint, load_autoencoder, read_split
 from train.files import write_text
-from train.interrupts import StopRequest
-from train.log import RunLog
-from train.parallel import World, gather
-from train.pictures import draw_predictions
-from train.runs import read_split
-from train.state import Training
-from train.systems import image_size
+from train.methods.systems import image_size
+from train.methods.weights import save_weights
+from train.processes import StopRequest
+from train.training.checkpoint import save_checkpoint
+from train.training.log import RunLog
+from train.training.pictures import draw_predictions
+from train.training.state import Training
 
 _HEALTH_IMAGES = 12
 # The number that records carry for a phase.

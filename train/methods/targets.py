@@ -7,7 +7,7 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, project, splat_depth
 from models.baselines import cell_centres, fixed_cameras
-from train.batches import Truth
+from train.data.batches import Truth
 
 # World units: the gaps between the 2048 points of a surface are closed, and outlines grow by no more than this.
 _POINT_RADIUS = 0.01

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from diffpoint import chamfer_distance, consistency_loss
 from models import Generator, Predictor
-from train.batches import Batch, LoadedSplit
 from train.config import InferenceConfig
+from train.data.batches import Batch, LoadedSplit
 from train.errors import UserError
-from train.inference import reconstruct
-from train.metrics import cloud_errors, thin_out, transport_error
+from train.evaluation.inference import reconstruct
+from train.evaluation.metrics import cloud_errors, thin_out, transport_error
 
 FIGURES = (
     "gt_to_pred",

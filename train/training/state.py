@@ -11,24 +11,19 @@ import torch
 from torch import Tensor, nn
 
 from models import Critic, Generator, build_autoencoder
-from train.batches import Batch, LoadedSplit, Sampler
-from train.checkpoint import (
-    best_weights,
-    load_autoencoder,
-    load_networks,
-    load_predictor,
-    load_state,
-    save_weights,
-)
 from train.config import FitConfig, PretrainConfig, StageConfig
+from train.data.batches import Batch, LoadedSplit, Sampler
+from train.distributed import ALONE, World
 from train.errors import UserError
-from train.health import sensitivity
-from train.laps import Laps
-from train.lessons import Given
-from train.parallel import ALONE, World
-from train.step import Chance, Learner, autoencoder_step, trainable, training_step
-from train.systems import METHODS, build_network, taught_step
-from train.validation import validate, validate_autoencoder
+from train.evaluation.runs import best_weights, load_autoencoder, load_predictor
+from train.evaluation.sensitivity import sensitivity
+from train.methods.lessons import Given
+from train.methods.step import Chance, Learner, autoencoder_step, trainable, training_step
+from train.methods.systems import METHODS, build_network, taught_step
+from train.methods.weights import save_weights
+from train.timer import Laps
+from train.training.checkpoint import load_networks, load_state
+from train.training.validation import validate, validate_autoencoder
 
 _DEAF_CHECKS = 3
 

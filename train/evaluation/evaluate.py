@@ -29,16 +29,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from models import Generator, Predictor
-from train.batches import LoadedSplit
 from train.config import FitConfig
+from train.data.batches import LoadedSplit
 from train.errors import UserError
+from train.evaluation.metrics import cloud_errors, thin_out
+from train.evaluation.per_shape import Scores, average, diversity, means, score, spreads, stacked
+from train.evaluation.retrieval import medoid, nearest_by_image
+from train.evaluation.runs import open_run
+from train.evaluation.sensitivity import sensitivity
 from train.files import write_text
-from train.health import sensitivity
-from train.metrics import cloud_errors, thin_out
-from train.runs import open_run
-from train.scoring import Scores, average, diversity, means, score, spreads, stacked
-from train.table import format_table
-from train.trivial import medoid, nearest_by_image
+from train.show.table import format_table
 
 VIEW_COUNTS = (1, 2, 4, 8)
 _DIVERSITY_CODES = 10

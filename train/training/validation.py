@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 
 from models import Autoencoder, Generator, Predictor
-from train.batches import LoadedSplit
-from train.metrics import cloud_errors, in_silhouette, thin_out, visible_error
-from train.parallel import ALONE, World
+from train.data.batches import LoadedSplit
+from train.distributed import ALONE, World
+from train.evaluation.metrics import cloud_errors, in_silhouette, thin_out, visible_error
 
 FIGURES = ("val_cd_1", "val_cd", "val_fps_cd", "val_visible", "val_inside")
 _SHAPES_AT_ONCE = 8

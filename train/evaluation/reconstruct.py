@@ -12,11 +12,11 @@ from torch import Tensor
 from diffpoint.io import write_points
 from train.data.choy import pictures_of
 from train.data.cutout import cut_out
+from train.data.images import is_cut_out, read_images, read_rgba
 from train.errors import UserError
+from train.evaluation.inference import reconstruct
+from train.evaluation.runs import open_run
 from train.files import replacing
-from train.images import is_cut_out, read_images, read_rgba
-from train.inference import reconstruct
-from train.runs import open_run
 
 MOST_IMAGES = 24
 _ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -38,7 +38,7 @@ def reconstruct_to_files(
     Raises:
         UserError: a run that is no run, an image that is no image, or a wrong number of either.
     """
-    from train.pages import write_reconstruction_page
+    from train.show.pages import write_reconstruction_page
 
     images = named_pictures(images)
     if not 1 <= len(images) <= MOST_IMAGES:

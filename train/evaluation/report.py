@@ -10,15 +10,14 @@ from typing import Any
 import torch
 
 from models import Generator
-from train import figures, pages
-from train.checkpoint import load_generator
 from train.config import FitConfig, fit_config_from_json
 from train.data import Shape, ShapeTree
 from train.errors import UserError
-from train.figures import Example
+from train.evaluation.inference import reconstruct
+from train.evaluation.runs import load_generator, read_metrics
 from train.files import write_text
-from train.inference import reconstruct
-from train.log import read_metrics
+from train.show import figures, pages
+from train.show.figures import Example
 
 _CODES = 4
 _SHAPES = 3

@@ -18,8 +18,8 @@ from train.data import store
 from train.data.categories import category_of, synset_of
 from train.data.tree import Shape, ShapeError, ShapeTree, read_shape
 from train.errors import UserError
-from train.figures import TRUE, close_up, from_behind
 from train.files import replacing
+from train.show.figures import TRUE, close_up, from_behind
 
 _CELL = 144
 _VIEWS = 4

@@ -21,10 +21,10 @@ from models.baselines import (
     pixel_centres,
     silhouettes,
 )
-from train.batches import Batch, Truth
 from train.config import StageConfig
-from train.objective import TRANSPORT_TOLERANCE, arrange_scenes, front_loss
-from train.truth import fixed_depth, solid_cells
+from train.data.batches import Batch, Truth
+from train.methods.losses import TRANSPORT_TOLERANCE, arrange_scenes, front_loss
+from train.methods.targets import fixed_depth, solid_cells
 
 _PROJECTIONS = 5
 

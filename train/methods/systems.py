@@ -28,12 +28,13 @@ from models.baselines import (
     build_ptn,
     build_r2n2,
 )
-from train import ideals, lessons
 from train.config import FitConfig, System
+from train.distributed import ALONE, World
 from train.errors import UserError
-from train.laps import Laps
-from train.parallel import ALONE, World
-from train.step import Learner, set_rate
+from train.methods import lessons
+from train.methods import oracles as ideals
+from train.methods.step import Learner, set_rate
+from train.timer import Laps
 
 
 @dataclasses.dataclass(frozen=True)

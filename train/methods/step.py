@@ -10,12 +10,12 @@ from torch import Tensor, nn
 
 from diffpoint import chamfer_distance
 from models import Autoencoder, Critic, Generator, critic_loss, generator_loss, gradient_penalty
-from train.batches import Batch
 from train.config import StageConfig
+from train.data.batches import Batch
+from train.distributed import ALONE, World
 from train.errors import UserError
-from train.laps import Laps
-from train.objective import arrange_scenes, spread_loss, supervise
-from train.parallel import ALONE, World
+from train.methods.losses import arrange_scenes, spread_loss, supervise
+from train.timer import Laps
 
 
 @dataclasses.dataclass

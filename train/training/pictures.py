@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from models import Predictor
-from train.batches import LoadedSplit
+from train.data.batches import LoadedSplit
 
 _SHAPES = 3
 _CODES = 3
@@ -22,7 +22,7 @@ def draw_predictions(model: Predictor, val: LoadedSplit, path: Path, *, seed: in
 
     The shapes and codes are the same at every call with the same seed.
     """
-    from train import figures  # matplotlib takes a second to import
+    from train.show import figures  # matplotlib takes a second to import
 
     generator = torch.Generator().manual_seed(seed)
     examples = []

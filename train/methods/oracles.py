@@ -16,8 +16,8 @@ from models.baselines import (
     pixel_centres,
     surface_points,
 )
-from train.batches import Truth
-from train.truth import fixed_depth, hull_cells, solid_cells
+from train.data.batches import Truth
+from train.methods.targets import fixed_depth, hull_cells, solid_cells
 
 Ideal = Callable[[Any, Truth], Tensor]
 """(network, truth of B shapes) -> (B, N, 3) clouds in the world frame, as the network itself would state them."""

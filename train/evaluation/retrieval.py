@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import chamfer_distance
-from train.batches import LoadedSplit
+from train.data.batches import LoadedSplit
 
 _MEDOID_SHAPES = 1000
 _MEDOID_POINTS = 256

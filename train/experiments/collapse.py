@@ -21,19 +21,19 @@ from tqdm import tqdm
 
 from models import Generator
 from models.parts import IMAGE_GAIN, IMAGE_MEAN
-from train import figures
-from train.batches import LoadedSplit
 from train.config import PROFILES, FitConfig, StageConfig
+from train.data.batches import LoadedSplit
 from train.errors import UserError
+from train.evaluation.runs import read_split
+from train.evaluation.sensitivity import sensitivity
 from train.experiments.paper import without_critic
 from train.experiments.side_by_side import run_side_by_side
 from train.experiments.workbench import Workbench, stage1_of
 from train.files import kept, write_text
-from train.health import sensitivity
-from train.runs import read_split
-from train.state import Training
-from train.systems import image_size
-from train.validation import validate
+from train.methods.systems import image_size
+from train.show import figures
+from train.training.state import Training
+from train.training.validation import validate
 
 STEPS = 500
 _MEASUREMENTS = 10

@@ -8,6 +8,7 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
+from train.evaluation.runs import complete_lines
 from train.files import write_text
 
 
@@ -25,7 +26,7 @@ class RunLog:
         self._events = None
         if not writes:
             return
-        write_text(self._path, "".join(line for line in _lines(self._path) if _step_of(line) <= step))
+        write_text(self._path, "".join(line for line in complete_lines(self._path) if _step_of(line) <= step))
         self._events = SummaryWriter(str(run / "events"), purge_step=step + 1)
 
     def write(self, step: int, values: dict[str, Any]) -> None:
@@ -42,18 +43,6 @@ class RunLog:
         """Flushes the events."""
         if self._events is not None:
             self._events.close()
-
-
-def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """All records of a run, in order."""
-    return [json.loads(line) for line in _lines(run / "metrics.jsonl")]
-
-
-def _lines(path: Path) -> list[str]:
-    """Complete lines; one cut short by a kill is left out."""
-    if not path.exists():
-        return []
-    return [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
 
 
 def _step_of(line: str) -> int:
