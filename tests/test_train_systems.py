@@ -9,6 +9,11 @@ from typing import Any, get_args
 
 import pytest
 import torch
+from train.methods.lessons import Given
+from train.methods.recipes import with_system
+from train.methods.systems import METHODS, build_network, cloud_size, image_size, system_of, taught_step
+from train.methods.targets import fixed_depth, hull_cells, solid_cells
+from train.training.state import Training
 
 from diffpoint import PinholeCamera, chamfer_distance, farthest_point_sample, splat_depth
 from diffpoint.io import read_points
@@ -23,12 +28,7 @@ from train.evaluation.evaluate import evaluate
 from train.evaluation.inference import reconstruct
 from train.evaluation.per_shape import compare, score
 from train.evaluation.runs import config_of, latest_checkpoint, load_generator, load_predictor, read_metrics
-from train.methods.lessons import Given
-from train.methods.recipes import with_system
-from train.methods.systems import METHODS, build_network, cloud_size, image_size, system_of, taught_step
-from train.methods.targets import fixed_depth, hull_cells, solid_cells
 from train.training import state as state_module
-from train.training.state import Training
 from train.training.trainer import fit
 
 _SMOKE = PROFILES["smoke"]
@@ -191,9 +191,11 @@ def test_one_batch_can_be_learnt_by_heart(system: System, steps: int, left: floa
         assert isinstance(stage, StageConfig)
         stage = dataclasses.replace(stage, steps=steps, learning_rate=2e-3, final_learning_rate=1e-3)
         batch, chance = training._draw(stage)
-        assert batch.truth is not None
+        assert batch.targets is not None
         losses = [
-            taught_step(learner, Given(batch, batch.truth, chance.codes, stage, step), lesson)["loss"].item()
+            taught_step(learner, Given(batch, batch.targets, chance.codes, stage, step), lesson)[
+                "loss"
+            ].item()
             for step in range(steps)
         ]
         if phase == "stage1":
@@ -207,10 +209,10 @@ def test_one_batch_can_be_learnt_by_heart(system: System, steps: int, left: floa
 def test_only_the_nearest_of_the_codes_clouds_learns(tiny_data: Path) -> None:
     training = Training(with_system(_SMOKE, "psgn-mon"), _split(tiny_data, "psgn-mon"))
     batch, chance = training._draw(training.config.stage1)
-    assert batch.truth is not None
+    assert batch.targets is not None
     generator = training.learner.generator
     codes = chance.codes.clone().requires_grad_()
-    given = Given(batch, batch.truth, codes, training.config.stage1, 0)
+    given = Given(batch, batch.targets, codes, training.config.stage1, 0)
     report = METHODS["psgn-mon"].lessons["stage1"](generator, given)
     assert report["loss"] < report["mean_of_all"]
     (gradient,) = torch.autograd.grad(report["loss"], codes)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
 from models import Autoencoder, Generator, Predictor
-from train.config import PROFILES, FitConfig, fit_config_from_json
+from train.config import FitConfig, fit_config_from_json
 from train.data.batches import LoadedSplit, load_split
 from train.errors import UserError
-from train.methods.recipes import with_system
-from train.methods.systems import system_of
-from train.methods.weights import PREDICTORS, read_weights
+from train.methods.weights import method_of, predictor_classes, read_weights
 
 PRETRAINED = "pretrained"
 """The word for the weights that come with the repository; a file or directory of that name goes first."""
@@ -115,7 +112,9 @@ def load_predictor(run_or_file: str | Path) -> Predictor:
         UserError: there is nothing of the kind, or it cannot be read.
     """
     path = Path(run_or_file)
-    return cast(Predictor, read_weights(_weights_of_run(path) if path.is_dir() else path, *PREDICTORS)).eval()
+    return cast(
+        Predictor, read_weights(_weights_of_run(path) if path.is_dir() else path, *predictor_classes())
+    ).eval()
 
 
 def load_autoencoder(run_or_file: str | Path) -> Autoencoder:
@@ -133,10 +132,7 @@ def config_of(run_or_file: str | Path, model: Predictor) -> FitConfig:
     file = Path(run_or_file) / "config.json"
     if file.exists():
         return fit_config_from_json(file.read_text(), where=str(file))
-    profile = PROFILES[model.profile]
-    if not isinstance(model, Generator):
-        return with_system(profile, system_of(model))
-    return dataclasses.replace(profile, deterministic=model.config.deterministic)
+    return method_of(model).recipe_of(model)
 
 
 def _weights_of_run(run: Path) -> Path:

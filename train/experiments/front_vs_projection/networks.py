@@ -80,7 +80,7 @@ class Taught:
             }
         every = max(1, changes["stage2"].steps // 4)
         return dataclasses.replace(
-            config, **changes, min_image_sensitivity=0.0, validate_every=every, health_every=every,
+            config, **changes, min_image_sensitivity=0.0, validate_every=every, collapse_check_every=every,
             validation_shapes=min(16, config.validation_shapes),
         )  # fmt: skip
 
