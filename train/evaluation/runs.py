@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
 from models import Autoencoder, Generator, Predictor
 from train.config import PROFILES, FitConfig, fit_config_from_json
@@ -115,7 +115,7 @@ def load_predictor(run_or_file: str | Path) -> Predictor:
         UserError: there is nothing of the kind, or it cannot be read.
     """
     path = Path(run_or_file)
-    return cast(Predictor, read_weights(_weights_of_run(path) if path.is_dir() else path, *PREDICTORS)).eval()
+    return read_weights(_weights_of_run(path) if path.is_dir() else path, *PREDICTORS).eval()
 
 
 def load_autoencoder(run_or_file: str | Path) -> Autoencoder:
@@ -133,10 +133,10 @@ def config_of(run_or_file: str | Path, model: Predictor) -> FitConfig:
     file = Path(run_or_file) / "config.json"
     if file.exists():
         return fit_config_from_json(file.read_text(), where=str(file))
-    profile = PROFILES[model.profile]
-    if not isinstance(model, Generator):
-        return with_system(profile, system_of(model))
-    return dataclasses.replace(profile, deterministic=model.config.deterministic)
+    profile, system = PROFILES[model.profile], system_of(model)
+    if system != "ours":
+        return with_system(profile, system)
+    return dataclasses.replace(profile, deterministic=not model.takes_codes)
 
 
 def _weights_of_run(run: Path) -> Path:

@@ -33,7 +33,7 @@ def fused_maps(network: StructureGenerator, truth: Truth) -> Tensor:
     size = network.config.map_size
     depth = fixed_depth(truth.points, size)
     pixels = pixel_centres(size).expand(*depth.shape[:2], -1, -1, -1)
-    return network.answer_of(Structure(pixels, depth, logits=depth.isfinite().to(depth) - 0.5))
+    return network.cloud_of(Structure(pixels, depth, logits=depth.isfinite().to(depth) - 0.5))
 
 
 def true_cells(network: RecurrentReconstruction, truth: Truth) -> Tensor:

@@ -19,6 +19,7 @@ from models import (
     Critic,
     Generator,
     GeneratorConfig,
+    Predictor,
     build_autoencoder,
     build_generator,
 )
@@ -52,7 +53,12 @@ _KINDS = {
     RecurrentReconstruction: ("diffpoint.r2n2", lambda c: build_r2n2(config=R2N2Config(**c))),
     SilhouetteReconstruction: ("diffpoint.ptn", lambda c: build_ptn(config=PTNConfig(**c))),
 }
-PREDICTORS = (Generator, StructureGenerator, RecurrentReconstruction, SilhouetteReconstruction)
+PREDICTORS: tuple[type[Predictor], ...] = (
+    Generator,
+    StructureGenerator,
+    RecurrentReconstruction,
+    SilhouetteReconstruction,
+)
 
 
 def save_weights(model: nn.Module, path: Path) -> None:
