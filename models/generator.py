@@ -15,10 +15,11 @@ import dataclasses
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from models.autoencoder import Autoencoder, ShapeDecoder
 from models.parts import CodeBranch, LatentDecoder, PointDecoder, image_trunk, initialise, prepare_images
+from models.predictor import Predictor
 from models.sizes import CODE_DIM, PROFILES, Ending, GeneratorConfig
 
 
@@ -68,10 +69,12 @@ class Prediction(NamedTuple):
     logits: Tensor | None = None
 
 
-class Generator(nn.Module):
+class Generator(Predictor):
     """G(I, r) -> (N, 3) points in the world frame. Call it, or `encode` once and `decode` many times."""
 
+    config: GeneratorConfig
     code_dim = CODE_DIM
+    joins_views = True
     computes_in: torch.dtype = torch.float32
     """torch.bfloat16 computes all layers but the last in half the precision: about twice as fast where the processor
     can multiply such numbers (avx512_bf16, amx), slower elsewhere. Weights and points stay float32."""
@@ -90,14 +93,9 @@ class Generator(nn.Module):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     @property
-    def points(self) -> int:
-        """Points per predicted cloud."""
-        return self.config.points
-
-    @property
-    def profile(self) -> str:
-        """Name of the size this network was built to."""
-        return self.config.profile
+    def takes_codes(self) -> bool:
+        """Whether predictions depend on the random codes."""
+        return not self.config.deterministic
 
     @property
     def ends_in_latent(self) -> bool:
@@ -129,6 +127,16 @@ class Generator(nn.Module):
             raise ValueError(f"Generator: 'images' must be (B, 3, H, W) in [0, 1]; got {tuple(images.shape)}")
         return self._decode(self.encode(images), codes)
 
+    @torch.no_grad()
+    def predict_views(self, images: Tensor, codes: Tensor | None = None) -> Tensor:
+        """(B, V, 3, H, W) images and (B, V, code_dim) codes -> (B, V, N, 3) points, one cloud per view, no graph."""
+        self.check_views(images)
+        if codes is None and self.takes_codes:
+            raise ValueError("Generator: 'codes' must be given: predictions depend on them")
+        shape = images.shape[:2]
+        codes = images.new_zeros(*shape, self.code_dim) if codes is None else codes
+        return self(images.flatten(0, 1), codes.flatten(0, 1)[None])[0].unflatten(0, shape)
+
     def encode(self, images: Tensor) -> Tensor:
         """(B, 3, H, W) images in [0, 1] -> (B, C, H/8, W/8) features, independent of the codes."""
         prepared = prepare_images(images, (self.config.image_height, self.config.image_width))
@@ -139,12 +147,12 @@ class Generator(nn.Module):
         """(B, C, h, w) features and (R, B, code_dim) codes -> (R, B, N, 3) points, as `forward`."""
         return _existing(self._decode(features, codes))
 
+    def dead_share(self, features: Tensor) -> float:
+        """Share of the trunk's output channels that are zero at every place of every image."""
+        return (features.amax((0, 2, 3)) <= 0).float().mean().item()
+
     def _decode(self, features: Tensor, codes: Tensor) -> Prediction:
-        if codes.ndim != 3 or codes.shape[1:] != (features.shape[0], self.code_dim):
-            raise ValueError(
-                f"Generator: 'codes' must be (R, {features.shape[0]}, {self.code_dim}) to match the images; "
-                f"got {tuple(codes.shape)}"
-            )
+        self.check_codes(codes, len(features))
         repeats = len(codes)
         with self._precision(features):
             if self.code_branch is None:

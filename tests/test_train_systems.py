@@ -355,7 +355,9 @@ def test_dense_answers_are_thinned_to_the_size_of_the_others(tiny_data: Path) ->
     split = _split(tiny_data, "lin", limit=1)
     network = METHODS["lin"].build("smoke")
     assert isinstance(network, Baseline)
-    answer = network.answers(split.float_images(torch.arange(1), torch.zeros(1, 1, dtype=torch.int64)))[0]
+    answer = network.predict_views(split.float_images(torch.arange(1), torch.zeros(1, 1, dtype=torch.int64)))[
+        0
+    ]
     assert answer.shape[1] == 4 * network.points
     index = farthest_point_sample(answer, network.points)
     thinned = torch.take_along_dim(answer, index[..., None], 1)

@@ -142,15 +142,15 @@ class StructureGenerator(Baseline):
         turned = self.world_from_cams[:, :3, :3] @ in_cams + self.world_from_cams[:, :3, 3:]
         return turned.transpose(2, 3).flatten(1, 2)
 
-    def answer_of(self, structure: Structure) -> Tensor:
+    def cloud_of(self, structure: Structure) -> Tensor:
         """The points of the pixels that are not empty, some left out or repeated: (B, 2*S*S, 3) in the world frame."""
         clouds, kept = self.fuse(structure), structure.logits.flatten(1) > 0
         count = kept.shape[1] // 4  # about as many pixels as an object covers
         answers = [_spread_over(cloud[_some(mask)], count) for cloud, mask in zip(clouds, kept, strict=True)]
         return torch.stack(answers)
 
-    def _answers(self, images: Tensor) -> Tensor:
-        return self.answer_of(self.structure(images.flatten(0, 1))).unflatten(0, images.shape[:2])
+    def _predict(self, images: Tensor) -> Tensor:
+        return self.cloud_of(self.structure(images.flatten(0, 1))).unflatten(0, images.shape[:2])
 
 
 def fixed_cameras(points: Tensor) -> Tensor:

@@ -114,7 +114,7 @@ class SilhouetteReconstruction(Baseline):
         """(B, 3, H, W) in [0, 1] -> (B, 32, 32, 32) in [0, 1], with gradient."""
         return self.inside * self.decoder(self.encoder(self._prepare(images)))[:, 0].sigmoid()
 
-    def _answers(self, images: Tensor) -> Tensor:
+    def _predict(self, images: Tensor) -> Tensor:
         occupancy = self.occupancy(images.flatten(0, 1))
         points = surface_points(occupancy, self.points, threshold=_THRESHOLD)
         return points.unflatten(0, images.shape[:2])

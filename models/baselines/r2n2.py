@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -69,7 +68,7 @@ def build_r2n2(profile: str = "cpu", *, config: R2N2Config | None = None) -> Rec
 
     Example:
         >>> model = build_r2n2("smoke")
-        >>> model.answers(torch.rand(2, 3, 3, 56, 56)).shape  # three images of each of two objects
+        >>> model.predict_views(torch.rand(2, 3, 3, 56, 56)).shape  # three images of each of two objects
         torch.Size([2, 1, 128, 3])
     """
     return RecurrentReconstruction(choose_config("build_r2n2", R2N2_PROFILES, profile, config))
@@ -78,7 +77,7 @@ def build_r2n2(profile: str = "cpu", *, config: R2N2Config | None = None) -> Rec
 class RecurrentReconstruction(Baseline):
     """Images of one object, any number of them -> the logits of an occupancy grid."""
 
-    reads_views_together: ClassVar[bool] = True
+    reads_views_together = True
     config: R2N2Config
 
     def __init__(self, config: R2N2Config) -> None:
@@ -128,7 +127,7 @@ class RecurrentReconstruction(Baseline):
             memory = self.memory(view, memory)
         return self.logits_of_cells(self.decoder(memory))
 
-    def _answers(self, images: Tensor) -> Tensor:
+    def _predict(self, images: Tensor) -> Tensor:
         occupancy = self.logits(images).softmax(1)[:, 1]
         return surface_points(occupancy, self.points, threshold=_THRESHOLD)[:, None]
 

@@ -22,13 +22,13 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeGuard
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from models import Generator, Predictor
+from models import Predictor
 from train.config import FitConfig
 from train.data.batches import LoadedSplit
 from train.errors import UserError
@@ -131,7 +131,7 @@ def _score(
 ) -> tuple[dict[int, Scores], dict[int, Scores]]:
     """Number of views -> scores of all seeds, with search and descent; and, if there are codes, without."""
     ways = [config.inference]
-    if _takes_codes(model):
+    if model.takes_codes:
         ways.append(dataclasses.replace(config.inference, groups=1, steps=0))
     tables: list[dict[int, Scores]] = [{} for _ in ways]
     # A descent over n views compares n (n - 1) pairs again and again: the bar counts work, not shapes.
@@ -185,13 +185,9 @@ def _network_figures(
             for n, scores in found.items()
             if "searched" in scores and n in random_codes
         },
-        "diversity": _diversity(model, test, members, seeds=seeds) if _takes_codes(model) else None,
+        "diversity": _diversity(model, test, members, seeds=seeds) if model.takes_codes else None,
         "sensitivity": {"image": moved.image, "code": moved.code},
     }
-
-
-def _takes_codes(model: Predictor) -> TypeGuard[Generator]:
-    return isinstance(model, Generator) and not model.config.deterministic
 
 
 def _agreement(found: Scores, random_codes: Scores) -> dict[str, float]:
@@ -204,7 +200,7 @@ def _agreement(found: Scores, random_codes: Scores) -> dict[str, float]:
 
 
 def _diversity(
-    model: Generator, test: LoadedSplit, members: dict[str, Tensor], *, seeds: Sequence[int]
+    model: Predictor, test: LoadedSplit, members: dict[str, Tensor], *, seeds: Sequence[int]
 ) -> dict[str, Any]:
     apart = torch.stack([diversity(model, test, codes=_DIVERSITY_CODES, seed=seed) for seed in seeds])
     return {

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import consistency_loss
-from models import Generator, Predictor
+from models import Predictor
 from train.config import InferenceConfig
 
 # Objects are worked on in groups that together predict about so many points: 16 objects in 24 views of the cpu
@@ -115,18 +115,12 @@ def _reconstruct(
 ) -> Reconstruction:
     """(B, V, 3, H, W) images and (G, B, V, D) candidates, few enough for memory."""
     shapes, views = images.shape[:2]
-    if not isinstance(model, Generator):
-        points = model.answers(images).flatten(1, 2)
-        nothing = torch.zeros(0, shapes)
-        return Reconstruction(points, candidates[0], nothing, torch.zeros(shapes, dtype=torch.int64))
+    if views == 1 or not model.takes_codes:
+        points = model.predict_views(images, candidates[0]).flatten(1, 2)
+        no_history = torch.zeros(0, shapes)
+        return Reconstruction(points, candidates[0], no_history, torch.zeros(shapes, dtype=torch.int64))
     with torch.no_grad():
         features = model.encode(images.flatten(0, 1)).unflatten(0, (shapes, views))
-        if views == 1 or model.config.deterministic:
-            clouds = _decode(model, features, candidates[0])
-            nothing = torch.zeros(0, shapes)
-            return Reconstruction(
-                clouds.flatten(1, 2), candidates[0], nothing, torch.zeros(shapes, dtype=torch.int64)
-            )
         codes = candidates[0]
         if settings.groups > 1:
             scores = [
@@ -136,13 +130,13 @@ def _reconstruct(
     return _descend(model, features, codes, settings)
 
 
-def _decode(model: Generator, features: Tensor, codes: Tensor) -> Tensor:
+def _decode(model: Predictor, features: Tensor, codes: Tensor) -> Tensor:
     """(B, V, C, h, w) features and (B, V, D) codes -> (B, V, N, 3)."""
     clouds = model.decode(features.flatten(0, 1), codes.flatten(0, 1)[None])[0]
     return clouds.unflatten(0, codes.shape[:2])
 
 
-def _descend(model: Generator, features: Tensor, codes: Tensor, settings: InferenceConfig) -> Reconstruction:
+def _descend(model: Predictor, features: Tensor, codes: Tensor, settings: InferenceConfig) -> Reconstruction:
     """Plain gradient descent on (B, V, D) codes; every object has its own loss, so objects do not interact."""
     codes = codes.clone()
     norms = codes.norm(dim=-1, keepdim=True)

@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from diffpoint import chamfer_distance, consistency_loss
-from models import Generator, Predictor
+from models import Predictor
 from train.config import InferenceConfig
 from train.data.batches import Batch, LoadedSplit
-from train.errors import UserError
 from train.evaluation.inference import reconstruct
 from train.evaluation.metrics import cloud_errors, thin_out, transport_error
 
@@ -87,7 +86,7 @@ def score(
 
 def _predictions(model: Predictor, points: Tensor, views: int) -> Tensor | None:
     """Every view's own cloud in a reconstruction (B, V*N, 3): (B, V, N, 3); None where views are read together."""
-    if not isinstance(model, Generator) and model.reads_views_together:
+    if model.reads_views_together:
         return None
     return points.unflatten(1, (views, -1))
 
@@ -121,7 +120,7 @@ def answers(
     """What a network makes of one image of each shape with several random codes, some shapes at a time.
 
     Args:
-        model: takes codes.
+        model: the network; the R predictions are equal if it takes no codes.
         test: the split whose images are shown.
         codes: how many, R.
         seed: draws views and codes.
@@ -129,12 +128,7 @@ def answers(
     Yields:
         (B,) numbers of shapes, their batch with the one view that is shown, and (R, B, N, 3) predictions in the world
         frame.
-
-    Raises:
-        UserError: the network takes no codes.
     """
-    if not isinstance(model, Generator):
-        raise UserError("several answers to one image come from a network with codes; this one has none")
     generator = torch.Generator().manual_seed(seed)
     for shapes, shown in one_view_each(test, seed):
         drawn = torch.randn(codes, len(shapes), model.code_dim, generator=generator)

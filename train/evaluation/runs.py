@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
 from models import Autoencoder, Generator, Predictor
 from train.config import FitConfig, fit_config_from_json
@@ -112,9 +112,7 @@ def load_predictor(run_or_file: str | Path) -> Predictor:
         UserError: there is nothing of the kind, or it cannot be read.
     """
     path = Path(run_or_file)
-    return cast(
-        Predictor, read_weights(_weights_of_run(path) if path.is_dir() else path, *predictor_classes())
-    ).eval()
+    return read_weights(_weights_of_run(path) if path.is_dir() else path, *predictor_classes()).eval()
 
 
 def load_autoencoder(run_or_file: str | Path) -> Autoencoder:

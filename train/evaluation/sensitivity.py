@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import chamfer_distance
-from models import Generator, Predictor
+from models import Predictor
 
 
 class Sensitivity(NamedTuple):
@@ -42,17 +42,12 @@ def sensitivity(model: Predictor, images: Tensor, *, seed: int = 0) -> Sensitivi
     if len(images) < 2:
         raise ValueError(f"sensitivity: needs at least 2 images, got {len(images)}")
     codes = torch.randn(2, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
-    codes, dead_share = codes.expand(2, len(images), -1), 0.0
-    if isinstance(model, Generator):
-        features = model.encode(images)
-        clouds = model.decode(features, codes)
-        dead_share = (features.amax((0, 2, 3)) <= 0).float().mean().item()
-    else:
-        clouds = model(images, codes)
+    features = model.encode(images)
+    clouds = model.decode(features, codes.expand(2, len(images), -1))
     return Sensitivity(
         image=_mean_cd100(clouds[0], clouds[0].roll(1, 0)),
         code=_mean_cd100(clouds[0], clouds[1]),
-        dead_share=dead_share,
+        dead_share=model.dead_share(features),
     )
 
 

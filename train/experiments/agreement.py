@@ -23,7 +23,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from diffpoint import consistency_loss
-from models import Generator
 from train.config import InferenceConfig
 from train.data.batches import LoadedSplit
 from train.errors import UserError
@@ -94,7 +93,7 @@ def agreement(
     """
     opened = open_run(run)
     model, config = opened.model, opened.config
-    if not isinstance(model, Generator) or model.config.deterministic:
+    if not model.takes_codes:
         raise UserError(f"{run} takes no codes: there is nothing to agree on by choosing them")
     test = bench.split(config, "test")
     if not 2 <= views <= test.views:

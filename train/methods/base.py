@@ -83,7 +83,7 @@ class Method(ABC):
 
     losses: ClassVar[Mapping[str, Loss]]
     sizes: ClassVar[Mapping[str, Any]]
-    network_class: ClassVar[type[nn.Module]]
+    network_class: ClassVar[type[Predictor]]
     weights_key: ClassVar[str]
     uses_targets: ClassVar[bool] = True
     needs_whole_batch: ClassVar[str] = ""

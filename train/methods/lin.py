@@ -107,7 +107,7 @@ class Lin(Method):
         size = network.config.map_size
         depth = fixed_depth(targets.points, size)
         pixels = pixel_centres(size).expand(*depth.shape[:2], -1, -1, -1)
-        return network.answer_of(Structure(pixels, depth, logits=depth.isfinite().to(depth) - 0.5))
+        return network.cloud_of(Structure(pixels, depth, logits=depth.isfinite().to(depth) - 0.5))
 
 
 def fixed_depth(points: Tensor, size: int) -> Tensor:

@@ -186,7 +186,7 @@ class Ours(Method):
             generator.adopt_decoder(state.autoencoder)
 
     def recipe_of(self, network: Predictor) -> FitConfig:
-        return dataclasses.replace(self.recipe(network.profile), deterministic=network.config.deterministic)
+        return dataclasses.replace(self.recipe(network.profile), deterministic=not network.takes_codes)
 
 
 # --- recipes

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
-from models import Autoencoder, AutoencoderConfig, Critic
+from models import Autoencoder, AutoencoderConfig, Critic, Predictor
 from train.errors import UserError
 from train.files import replacing
 from train.methods import METHODS, get_method
@@ -49,12 +49,12 @@ def _kinds() -> dict[type[nn.Module], _Kind]:
     return kinds
 
 
-def predictor_classes() -> tuple[type[nn.Module], ...]:
+def predictor_classes() -> tuple[type[Predictor], ...]:
     """The classes of networks that predict shapes, those of all methods."""
     return tuple(dict.fromkeys(get_method(name).network_class for name in METHODS))
 
 
-def method_of(network: nn.Module) -> Method:
+def method_of(network: Predictor) -> Method:
     """The method of a network without a configuration: the first one in `METHODS` with networks of this class."""
     return next(method for method in map(get_method, METHODS) if type(network) is method.network_class)
 

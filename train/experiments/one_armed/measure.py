@@ -148,7 +148,7 @@ def _answers(bench: Workbench, config: FitConfig, chairs: list[OneArmedChair], s
         images = pictures.permute(0, 1, 4, 2, 3).float() / 255
         points = reconstruct(model, images, seed=config.seed, settings=config.inference).points
         found[arms] = points.unflatten(1, (2, -1)).contiguous()
-        if not model.config.deterministic:
+        if model.takes_codes:
             with torch.no_grad():
                 found[f"{arms}, codes"] = model(images[:, 0], codes).transpose(0, 1).contiguous()
     return found
