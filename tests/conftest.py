@@ -32,9 +32,9 @@ def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def smoke_run(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the smoke profile on the tiny tree: 30 steps of stage 1, 20 of stage 2."""
-    from train.config import PROFILES
+    from train.methods import recipe
     from train.training.trainer import fit
 
     run = tmp_path_factory.mktemp("runs") / "smoke"
-    assert fit(tiny_data, run, PROFILES["smoke"], progress=False)
+    assert fit(tiny_data, run, recipe("ours", "smoke"), progress=False)
     return run
