@@ -54,11 +54,12 @@ def test_imports_point_down(floor):
 
 def test_kernels_import_taichi_only_and_the_reference_torch_only():
     for path in files("diffpoint/kernels"):
-        allowed = {"taichi", "quadrants", "diffpoint.kernels", "types", "os"}
+        allowed = {"taichi", "quadrants", "types"}
         others = {
             n
             for n in imported(path)
-            if n.split(".")[0] not in allowed and not n.startswith("diffpoint.kernels")
+            if n.split(".")[0] not in allowed
+            and not n.startswith(("diffpoint.kernels", "diffpoint._backend"))
         }
         assert not others, f"{path.relative_to(ROOT)} imports {sorted(others)}"
     for path in files("diffpoint"):
