@@ -61,7 +61,8 @@ def fused_projection_loss(state: TrainState, batch: Batch, noise: Noise, step: S
     views = torch.randperm(depth.shape[1], generator=random)[:_PROJECTIONS]
     depth = for_each_image(depth[:, views], batch)
     # Both terms count per pixel of the foreground, as their sums do in the publication.
-    mask_weight = 1 / depth.isfinite().float().mean().item()
+    foreground = depth.isfinite().float().mean().item()
+    mask_weight = 1 / max(foreground, 1 / depth.numel())  # thin shapes may leave every small map empty
     loss = projection_loss(
         points, target_cameras(batch, views), depth,
         logits=logits, mask_weight=mask_weight, upsample=network.config.upsample,

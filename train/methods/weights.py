@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -35,7 +34,6 @@ class _Kind(NamedTuple):
     build: Callable[[dict[str, Any]], nn.Module]
 
 
-@functools.cache
 def _kinds() -> dict[type[nn.Module], _Kind]:
     """The networks of all methods, and the two that train beside them."""
     kinds: dict[type[nn.Module], _Kind] = {

@@ -189,7 +189,7 @@ class Trainer:
         self.state = self.method.new_state(config)
         if config.start:
             self._load_weights(Path(config.start))
-        self._enter(next(iter(config.phases)))
+        self.enter_phase(next(iter(config.phases)))
 
     @property
     def phase(self) -> PretrainConfig | StageConfig:
@@ -220,7 +220,7 @@ class Trainer:
             Scalars without gradient, for the log.
         """
         state, timer, phase = self.state, self.timer, self.phase
-        batch, noise = self._draw()
+        batch, noise = self.draw_batch()
         timer.mark("data")
 
         set_learning_rate(state.optimiser, phase.learning_rate_at(self.step))
@@ -240,8 +240,8 @@ class Trainer:
         self.total_steps += 1
         return {name: value.detach() for name, value in terms.items()}
 
-    def _draw(self) -> tuple[Batch | Tensor, Noise]:
-        """This process's shard of a batch, and the random numbers that belong to it."""
+    def draw_batch(self) -> tuple[Batch | Tensor, Noise]:
+        """Draws the next batch of the current phase: this process's shard, and the random numbers that belong to it."""
         phase, shard = self.phase, self.world.shard
         if isinstance(phase, PretrainConfig):
             return self._draw_clouds(phase.shapes), Noise(torch.empty(0), torch.empty(0))
@@ -273,14 +273,15 @@ class Trainer:
     def begin_phase(self, name: str, run: Path) -> None:
         """Starts a phase from the best weights of the phases before, with a new optimiser; the critic goes on."""
         self.world.barrier()  # until the main process has written those weights
-        self._enter(name)
+        self.enter_phase(name)
         if name == "stage1" and self.config.needs_autoencoder:
             self._load_autoencoder(run)
         if name == "stage2" and "stage1" in self.config.phases:
             self._load_weights(best_weights(run, 1))
         self.method.begin_phase(self.state, name)
 
-    def _enter(self, name: str) -> None:
+    def enter_phase(self, name: str) -> None:
+        """Starts a phase with the weights as they are, and a new optimiser."""
         self.phase_name, self.step, self.best = name, 0, math.inf
         self.collapse_check = CollapseCheck(self.config)
         state, phase = self.state, self.phase
@@ -375,7 +376,7 @@ class Trainer:
             raise UserError(
                 f"{checkpoint} was trained on other data (their shapes or points differ); resume with those"
             )
-        self._enter(saved["phase"])
+        self.enter_phase(saved["phase"])
         if not self.pretraining and self.config.needs_autoencoder:
             self._load_autoencoder(run)
         load_networks(checkpoint, self.networks())
