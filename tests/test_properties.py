@@ -20,6 +20,7 @@ from properties import strategies as throw
 from properties.judge import AGREED, REFUSED
 
 import diffpoint as dp
+from diffpoint.visibility import METHODS
 
 EXAMPLES = 20  # of every family of clouds, at every op
 
@@ -65,7 +66,7 @@ def arguments(name: str, largest: int, family: str) -> tuple[st.SearchStrategy, 
         "sample_view": (renderings(largest, family),),
         "visible_points": (
             renderings(largest, family, radius=False),
-            st.sampled_from(["zbuffer", "radius", "pyramid", "cone", "horizon", "hpr"]),
+            st.sampled_from(METHODS),
         ),
         "project": (renderings(largest, family, lengths=False, radius=False),),
         "unproject": (maps(1, family),),

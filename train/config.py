@@ -26,7 +26,7 @@ OutputHead = Literal["points", "latent"]
 Precision = Literal["float32", "bfloat16"]
 Supervision = Literal["front", "projection", "lin", "soft"]
 # The methods of `diffpoint.visible_points`, whose import would load torch; a test compares them.
-Visibility = Literal["zbuffer", "radius", "pyramid", "cone", "horizon", "hpr"]
+Visibility = Literal["zbuffer", "horizon", "hpr"]
 
 # The paper's alpha multiplies the released code's approximate EMD: a sum over 2048 points, about 1.3 times
 # the exact optimum. Ours is exact and a mean, so that it means the same at any number of points.
