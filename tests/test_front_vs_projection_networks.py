@@ -151,7 +151,7 @@ def test_points_that_do_not_exist_are_replaced_by_those_that_do() -> None:
     model = build_network(config)
     assert isinstance(model, Generator)
     assert isinstance(model.decoder, PointDecoder)
-    assert model.config == dataclasses.replace(SIZES["smoke"], existence=True)
+    assert model.config == dataclasses.replace(SIZES["smoke"], occupancy_logits=True)
     images, codes = torch.rand(2, 3, 64, 64), torch.randn(3, 2, model.code_dim)
     predicted = model.predict(images, codes)
     assert predicted.logits is not None
@@ -175,8 +175,10 @@ def test_supervision_belongs_to_our_own_system(tmp_path: Path) -> None:
     latent = dataclasses.replace(PROFILES["smoke"], ending="latent", stage1=_lin(PROFILES["smoke"].stage1))
     with pytest.raises(UserError, match="leave --ending at points"):
         build_network(latent)
-    with pytest.raises(ValueError, match="existence needs"):
-        build_generator(config=dataclasses.replace(SIZES["smoke"], existence=True, ending="latent"))
+    with pytest.raises(ValueError, match="occupancy_logits needs"):
+        build_generator(
+            config=dataclasses.replace(SIZES["smoke"], occupancy_logits=True, output_head="latent")
+        )
 
 
 def _lin(stage):

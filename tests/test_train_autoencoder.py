@@ -116,7 +116,7 @@ def test_it_learns_boxes() -> None:
 def test_a_generator_can_end_in_the_decoder(tmp_path: Path) -> None:
     """The paper's written network: the points are the decoder's, which learns nothing; its file stands alone."""
     torch.manual_seed(0)
-    autoencoder, model = build_autoencoder("smoke"), build_generator("smoke", ending="latent")
+    autoencoder, model = build_autoencoder("smoke"), build_generator("smoke", output_head="latent")
     model.adopt_decoder(autoencoder)
     images, codes = torch.rand(2, 3, 48, 64), torch.randn(3, 2, model.code_dim)
     predicted = model.predict(images, codes)
@@ -129,10 +129,10 @@ def test_a_generator_can_end_in_the_decoder(tmp_path: Path) -> None:
     save_weights(model, tmp_path / "latent.safetensors")
     back = load_generator(tmp_path / "latent.safetensors")
     assert torch.equal(back(images, codes), predicted.points)
-    with pytest.raises(ValueError, match="ending='latent'"):
+    with pytest.raises(ValueError, match="output_head='latent'"):
         build_generator("smoke").adopt_decoder(autoencoder)
-    with pytest.raises(ValueError, match="ending must be"):
-        dataclasses.replace(SIZES["smoke"], ending="code")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="output_head must be"):
+        dataclasses.replace(SIZES["smoke"], output_head="code")  # type: ignore[arg-type]
 
 
 def test_a_run_with_a_latent_ending_reuses_an_auto_encoder(

@@ -85,8 +85,8 @@ def size_of(config: FitConfig) -> GeneratorConfig:
     return dataclasses.replace(
         SIZES[config.profile],
         deterministic=config.deterministic,
-        ending=config.ending,
-        existence=config.existence,
+        output_head=config.ending,
+        occupancy_logits=config.existence,
     )
 
 

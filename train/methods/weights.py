@@ -59,6 +59,8 @@ PREDICTORS: tuple[type[Predictor], ...] = (
     RecurrentReconstruction,
     SilhouetteReconstruction,
 )
+# Names of a network's settings in the headers of earlier versions.
+OLD_NAMES = {"ending": "output_head", "existence": "occupancy_logits"}
 
 
 def save_weights(model: nn.Module, path: Path) -> None:
@@ -84,7 +86,7 @@ def read_weights(path: Path, *kinds: type[_Network]) -> _Network:
         if not found:
             raise ValueError(f"it has no {_KINDS[kinds[0]][0]} header")
         name, build = found[0]
-        model = build(_with_tuples(json.loads(headers[name])))
+        model = build(_settings(json.loads(headers[name])))
         theirs, ours = (
             {key: value.shape for key, value in of.items()} for of in (tensors, model.state_dict())
         )
@@ -101,9 +103,12 @@ def read_weights(path: Path, *kinds: type[_Network]) -> _Network:
     return model
 
 
-def _with_tuples(config: dict[str, Any]) -> dict[str, Any]:
-    """JSON knows lists only; configurations hold tuples."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in config.items()}
+def _settings(header: dict[str, Any]) -> dict[str, Any]:
+    """A header's settings under today's names; JSON has lists in place of tuples."""
+    return {
+        OLD_NAMES.get(name, name): tuple(value) if isinstance(value, list) else value
+        for name, value in header.items()
+    }
 
 
 @contextmanager

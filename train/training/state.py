@@ -70,7 +70,7 @@ class Training:
         self._enter(name)
         if name == "stage1" and self.config.needs_autoencoder:
             self._take_autoencoder(run)
-            if self.learner.generator.ends_in_latent:
+            if self.learner.generator.predicts_latents:
                 self.learner.generator.adopt_decoder(self.learner.autoencoder)
         if name == "stage2" and "stage1" in self.config.phases:
             self._take_weights(best_weights(run, 1))
@@ -88,7 +88,7 @@ class Training:
     def _take_autoencoder(self, run: Path) -> None:
         found = load_autoencoder(best_weights(run, "autoencoder"))
         wanted = self.learner.generator.points
-        if self.learner.generator.ends_in_latent and found.config.points != wanted:
+        if self.learner.generator.predicts_latents and found.config.points != wanted:
             raise UserError(
                 f"the auto-encoder makes {found.config.points} points, the generator that is to end in it {wanted}; "
                 "train one of this profile, or leave --autoencoder out"
