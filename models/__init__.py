@@ -1,4 +1,4 @@
-"""Networks: images and random codes in, point clouds out. Files, data and losses are train's."""
+"""Networks: images and random codes in, point clouds out. They do not depend on files, data or losses."""
 
 from models.autoencoder import LATENT_DIM, Autoencoder, AutoencoderConfig, build_autoencoder
 from models.critic import Critic, critic_loss, generator_loss, gradient_penalty

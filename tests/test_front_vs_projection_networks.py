@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from train.methods.systems import build_network
 
 from diffpoint import PinholeCamera
 from models import Generator, build_generator
@@ -22,7 +23,6 @@ from train.experiments.front_vs_projection.networks import TAUGHT, configs, dens
 from train.experiments.front_vs_projection.study import front_vs_projection
 from train.experiments.run import Workbench
 from train.methods.losses import Scene, supervise
-from train.methods.systems import build_network
 
 INFINITY = float("inf")
 
@@ -151,7 +151,7 @@ def test_points_that_do_not_exist_are_replaced_by_those_that_do() -> None:
     model = build_network(config)
     assert isinstance(model, Generator)
     assert isinstance(model.decoder, PointDecoder)
-    assert model.config == dataclasses.replace(SIZES["smoke"], existence=True)
+    assert model.config == dataclasses.replace(SIZES["smoke"], occupancy_logits=True)
     images, codes = torch.rand(2, 3, 64, 64), torch.randn(3, 2, model.code_dim)
     predicted = model.predict(images, codes)
     assert predicted.logits is not None
@@ -175,8 +175,10 @@ def test_supervision_belongs_to_our_own_system(tmp_path: Path) -> None:
     latent = dataclasses.replace(PROFILES["smoke"], ending="latent", stage1=_lin(PROFILES["smoke"].stage1))
     with pytest.raises(UserError, match="leave --ending at points"):
         build_network(latent)
-    with pytest.raises(ValueError, match="existence needs"):
-        build_generator(config=dataclasses.replace(SIZES["smoke"], existence=True, ending="latent"))
+    with pytest.raises(ValueError, match="occupancy_logits needs"):
+        build_generator(
+            config=dataclasses.replace(SIZES["smoke"], occupancy_logits=True, output_head="latent")
+        )
 
 
 def _lin(stage):

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from train.methods.step import autoencoder_step
+from train.training.state import Training
 
 from models import PROFILES as SIZES
 from models import Autoencoder, AutoencoderConfig, build_autoencoder, build_generator
@@ -15,9 +17,7 @@ from train.config import PROFILES
 from train.data.batches import load_split
 from train.errors import UserError
 from train.evaluation.runs import best_weights, load_autoencoder, load_generator, read_metrics
-from train.methods.step import autoencoder_step
 from train.methods.weights import save_weights
-from train.training.state import Training
 from train.training.trainer import fit
 
 _SMOKE = PROFILES["smoke"]
@@ -116,7 +116,7 @@ def test_it_learns_boxes() -> None:
 def test_a_generator_can_end_in_the_decoder(tmp_path: Path) -> None:
     """The paper's written network: the points are the decoder's, which learns nothing; its file stands alone."""
     torch.manual_seed(0)
-    autoencoder, model = build_autoencoder("smoke"), build_generator("smoke", ending="latent")
+    autoencoder, model = build_autoencoder("smoke"), build_generator("smoke", output_head="latent")
     model.adopt_decoder(autoencoder)
     images, codes = torch.rand(2, 3, 48, 64), torch.randn(3, 2, model.code_dim)
     predicted = model.predict(images, codes)
@@ -129,10 +129,10 @@ def test_a_generator_can_end_in_the_decoder(tmp_path: Path) -> None:
     save_weights(model, tmp_path / "latent.safetensors")
     back = load_generator(tmp_path / "latent.safetensors")
     assert torch.equal(back(images, codes), predicted.points)
-    with pytest.raises(ValueError, match="ending='latent'"):
+    with pytest.raises(ValueError, match="output_head='latent'"):
         build_generator("smoke").adopt_decoder(autoencoder)
-    with pytest.raises(ValueError, match="ending must be"):
-        dataclasses.replace(SIZES["smoke"], ending="code")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="output_head must be"):
+        dataclasses.replace(SIZES["smoke"], output_head="code")  # type: ignore[arg-type]
 
 
 def test_a_run_with_a_latent_ending_reuses_an_auto_encoder(

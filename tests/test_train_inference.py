@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from diffpoint import consistency_loss
-from models import Generator, build_generator
+from models import PROFILES, Generator, build_generator
 from train.config import InferenceConfig
 from train.evaluation.inference import reconstruct
+from train.evaluation.runs import load_generator
+from train.methods.weights import save_weights
 
 
 @pytest.fixture(scope="module")
@@ -190,3 +196,34 @@ def test_wrong_arguments_are_named(model: Generator) -> None:
         reconstruct(model, torch.ones(2, 3, 48, 64), groups=0)
     with pytest.raises(ValueError, match=r"patience >= 0; got 5, 30 and -1"):
         reconstruct(model, torch.ones(2, 3, 48, 64), settings=InferenceConfig(patience=-1))
+
+
+# --- weights
+
+
+def _header(path: Path) -> dict:
+    with safe_open(path, framework="pt") as file:
+        return json.loads(file.metadata()["diffpoint.generator"])
+
+
+def test_headers_of_earlier_versions_are_read_and_new_names_written(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = build_generator(config=dataclasses.replace(PROFILES["smoke"], occupancy_logits=True))
+    save_weights(model, tmp_path / "new.safetensors")
+    header = _header(tmp_path / "new.safetensors")
+    assert header == dataclasses.asdict(model.config)
+
+    header["ending"], header["existence"] = header.pop("output_head"), header.pop("occupancy_logits")
+    tensors = {name: value.contiguous() for name, value in model.state_dict().items()}
+    save_file(tensors, tmp_path / "old.safetensors", {"diffpoint.generator": json.dumps(header)})
+    old = load_generator(tmp_path / "old.safetensors")
+    assert old.config == model.config
+    assert all(torch.equal(value, model.state_dict()[name]) for name, value in old.state_dict().items())
+
+
+def test_the_shipped_weights_have_an_old_header_and_load() -> None:
+    weights = Path(__file__).parents[1] / "train" / "pretrained" / "generator.safetensors"
+    assert "ending" in _header(weights)
+    model = load_generator(weights)
+    assert model.config.output_head == "points"
+    assert not model.training

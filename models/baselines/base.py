@@ -90,7 +90,7 @@ def initialise_rectified(network: nn.Module) -> None:
         if isinstance(module, (nn.Conv2d, nn.Conv3d, nn.Linear)):
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
         elif isinstance(module, nn.ConvTranspose3d):
-            # A value of the output meets as many inputs as strided taps reach it.
+            # Of a strided transposed kernel only a part of the taps contributes to each output value.
             taps = 1.0
             for side, stride in zip(module.kernel_size, module.stride, strict=True):
                 taps *= side / stride

@@ -159,8 +159,8 @@ class Ours(Method):
         return dataclasses.replace(
             SIZES[config.profile],
             deterministic=config.deterministic,
-            ending=config.output_head,
-            existence=config.occupancy_logits,
+            output_head=config.output_head,
+            occupancy_logits=config.occupancy_logits,
         )
 
     def build(self, config: FitConfig) -> Generator:
@@ -181,7 +181,7 @@ class Ours(Method):
         """Before stage 1, gives a generator with the latent output head the decoder of the auto-encoder."""
         generator = state.network
         assert isinstance(generator, Generator)
-        if phase == "stage1" and generator.ends_in_latent:
+        if phase == "stage1" and generator.shape_decoder is not None:
             assert state.autoencoder is not None
             generator.adopt_decoder(state.autoencoder)
 

@@ -21,6 +21,9 @@ from train.methods.base import Method
 
 _Network = TypeVar("_Network", bound=nn.Module)
 
+# Names of a network's settings in the headers of earlier versions.
+OLD_NAMES = {"ending": "output_head", "existence": "occupancy_logits"}
+
 
 class OtherVersionError(UserError):
     """The file is intact, but this version of diffpoint builds its network differently."""
@@ -80,7 +83,7 @@ def read_weights(path: Path, *kinds: type[_Network]) -> _Network:
         if not found:
             raise ValueError(f"it has no {_kinds()[kinds[0]].header} header")
         name, build = found[0]
-        model = build(_with_tuples(json.loads(headers[name])))
+        model = build(_settings(json.loads(headers[name])))
         theirs, ours = (
             {key: value.shape for key, value in of.items()} for of in (tensors, model.state_dict())
         )
@@ -97,9 +100,12 @@ def read_weights(path: Path, *kinds: type[_Network]) -> _Network:
     return cast(_Network, model)
 
 
-def _with_tuples(config: dict[str, Any]) -> dict[str, Any]:
-    """JSON has lists only; configurations have tuples."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in config.items()}
+def _settings(header: dict[str, Any]) -> dict[str, Any]:
+    """A header's settings under today's names; JSON has lists in place of tuples."""
+    return {
+        OLD_NAMES.get(name, name): tuple(value) if isinstance(value, list) else value
+        for name, value in header.items()
+    }
 
 
 @contextmanager
