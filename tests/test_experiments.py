@@ -1,115 +1,84 @@
-"""Experiments: what they measure is what they write, on paper and in JSON."""
+"""The frame of the experiments: what is trained and measured once is found again, and tables, status and page show
+it."""
 
 from __future__ import annotations
 
-import importlib
-import json
+import dataclasses
 from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
 
-from models import build_generator
-from train.config import InferenceConfig
-from train.errors import UserError
-from train.evaluation.evaluate import evaluate
-from train.evaluation.per_shape import Scores, score
-from train.experiments.agreement import WAYS, agreement
-from train.experiments.run import EXPERIMENTS, Workbench, run_experiment
-from train.methods.weights import save_weights
-
-_WAYS = {
-    "random codes": InferenceConfig(groups=1, steps=0),
-    "searched": InferenceConfig(groups=3, steps=0),
-    "descended": InferenceConfig(groups=3, steps=3, step_size=1.0),
-}
+import train.experiments.study as study_module
+from train.config import FitConfig, StageConfig
+from train.experiments import store
+from train.experiments.study import Study, unchanged
 
 
-def test_agreement_writes_what_it_measured(smoke_run: Path, tiny_data: Path, tmp_path: Path) -> None:
-    bench = Workbench((tiny_data,), tmp_path, "smoke", seeds=2, limit=2, progress=False)
-    found = agreement(bench, smoke_run, views=3, ways=_WAYS)
-    assert json.loads((tmp_path / "agreement.json").read_text()) == json.loads(json.dumps(found))
-    assert sorted(path.name for path in tmp_path.glob("*.*")) == [
-        f"agreement.{kind}" for kind in ("json", "md", "png")
-    ]
-    loss = {name: way["mean"]["consistency"] for name, way in found["ways"].items()}
-    assert loss["descended"] < loss["searched"] < loss["random codes"]
-    assert found["ways"]["descended"]["lowered_share"] == 1
-    assert found["ways"]["searched"]["lowered_share"] is None
-    assert found["ways"]["random codes"]["against_random"]["cd"] == {"mean": 0, "standard_error": 0}
-    change = found["ways"]["descended"]["against_random"]["fps_cd"]["mean"]
-    means = [found["ways"][name]["mean"]["fps_cd"] for name in ("descended", "random codes")]
-    assert change == pytest.approx(means[0] - means[1], abs=1e-4)
-    assert all(-1 <= r <= 1 for pair in found["correlation"].values() for r in pair.values())
-    text = (tmp_path / "agreement.md").read_text()
-    assert f"| {loss['descended']:.2f} |" in text
-    assert f"disagree by {found['floor']:.2f}" in text
-    with Image.open(tmp_path / "agreement.png") as picture:
-        assert picture.size[0] > 1000
+@pytest.fixture
+def fresh(tiny_data: Path, tmp_path: Path) -> Study:
+    """Nothing is trained."""
+    return Study((tiny_data,), tmp_path / "out", "smoke", seeds=1, steps=2, limit=4, progress=False)
 
 
-def test_agreement_goes_on_where_it_was(
-    smoke_run: Path, tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_run_is_found_by_its_whole_configuration(fresh: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = fresh.config(unchanged, seed=0)
+    run = fresh.run_of(config)
+    assert fresh.run_of(dataclasses.replace(config)) == run
+    # A value that equals the default of its field counts like any other: another default is another run.
+    penalty = next(field for field in dataclasses.fields(StageConfig) if field.name == "penalty")
+    assert config.stage1.penalty == penalty.default
+    monkeypatch.setattr(penalty, "default", 5.0)
+    assert fresh.run_of(config) == run
+    stage1 = dataclasses.replace(config.stage1, penalty=5.0)
+    assert fresh.run_of(dataclasses.replace(config, stage1=stage1)) != run
+
+    @dataclasses.dataclass(frozen=True)
+    class Later(FitConfig):
+        new_field: int = 7
+
+    later = Later(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
+    assert fresh.run_of(later) != run
+
+
+def test_every_field_that_changes_weights_is_part_of_the_key(fresh: Study) -> None:
+    config = fresh.config(unchanged, seed=0)
+    described = fresh.run_key(config)["config"]
+    left_out = {field.name for field in dataclasses.fields(config)} - set(described)
+    assert left_out == {
+        "inference", "seed", "log_every", "picture_every", "checkpoint_every", "keep_checkpoints"
+    }  # fmt: skip
+    for stage in ("stage1", "stage2", "pretrain"):
+        assert described[stage] == dataclasses.asdict(getattr(config, stage))
+
+
+def test_other_data_or_training_code_is_another_run(
+    fresh: Study, tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scored: list[object] = []
-
-    def counted(*args: object, **settings: object) -> Scores:
-        scored.append(settings)
-        if len(scored) == 3:
-            raise KeyboardInterrupt
-        return score(*args, **settings)
-
-    module = importlib.import_module("train.experiments.agreement")
-    monkeypatch.setattr(module, "score", counted)
-    monkeypatch.setattr(module, "_GROUPS", 2)
-    bench = Workbench((tiny_data,), tmp_path, "smoke", seeds=1, limit=2, progress=False)
-    with pytest.raises(KeyboardInterrupt):
-        agreement(bench, smoke_run, views=2, ways=_WAYS)
-    found = agreement(bench, smoke_run, views=2, ways=_WAYS)
-    # The one that was interrupted is the only one that is taken again.
-    assert len(scored) == 1 + len(_WAYS) + 2
-    assert agreement(bench, smoke_run, views=2, ways=_WAYS) == found
-    assert len(scored) == 1 + len(_WAYS) + 2  # all was kept
-    other = tmp_path / "other.safetensors"
-    torch.manual_seed(0)
-    save_weights(build_generator("smoke"), other)
-    assert agreement(bench, other, views=2, ways=_WAYS)["ways"] != found["ways"]
+    config = fresh.config(unchanged, seed=0)
+    run = fresh.run_of(config)
+    assert fresh.run_of(dataclasses.replace(config, seed=1)).name == run.name.replace("seed0", "seed1")
+    for path in tiny_data.glob("data_list/*/*.list"):
+        target = tmp_path / "other" / path.relative_to(tiny_data)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(path.read_text() + "03001627/another\n")
+    assert dataclasses.replace(fresh, data=(tmp_path / "other",)).run_of(config).name != run.name
+    monkeypatch.setattr(study_module, "TRAINING_VERSION", 2)
+    assert fresh.run_of(config) != run
 
 
-def test_random_codes_are_those_of_the_evaluation(smoke_run: Path, tiny_data: Path, tmp_path: Path) -> None:
-    bench = Workbench((tiny_data,), tmp_path, "smoke", seeds=1, progress=False)
-    found = agreement(bench, smoke_run, views=2, ways={"random codes": _WAYS["random codes"]})
-    scored = evaluate(smoke_run, tiny_data, views=(2,), out=tmp_path / "evaluation.json", progress=False)
-    assert found["ways"]["random codes"]["mean"] == pytest.approx(scored["random_codes"]["2"])
-
-
-def test_the_paper_s_setting_is_among_the_ways() -> None:
-    assert InferenceConfig(groups=5, steps=30, step_size=0.5) in WAYS.values()
-    assert WAYS["random codes"] == InferenceConfig(groups=1, steps=0)
-
-
-@pytest.mark.parametrize("name", sorted(set(EXPERIMENTS) - {"front-vs-projection", "photos", "runtime"}))
-def test_no_data_is_said_and_nothing_written(name: str, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="no data; name one or more data trees with --data"):
-        run_experiment(name, Workbench((), tmp_path, "smoke", progress=False))
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("views", [1, 5])
-def test_a_wrong_number_of_views_is_refused(
-    views: int, smoke_run: Path, tiny_data: Path, tmp_path: Path
-) -> None:
-    with pytest.raises(UserError, match=rf"between 2 and the 4 that .* got {views}"):
-        bench = Workbench((tiny_data,), tmp_path, "smoke", progress=False)
-        run_experiment("agreement", bench, run=smoke_run, views=views)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_network_without_codes_is_refused(tiny_data: Path, tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    weights = tmp_path / "plain.safetensors"
-    save_weights(build_generator("smoke", deterministic=True), weights)
-    with pytest.raises(UserError, match="takes no codes"):
-        run_experiment("agreement", Workbench((tiny_data,), tmp_path / "out", progress=False), run=weights)
-    assert not (tmp_path / "out").exists()
+def test_packed_metrics_are_found_as_single_ones_are(tmp_path: Path) -> None:
+    keys = [["a", 1], ["a", 2], [{"config": {"steps": 3}}, "test"]]
+    values = [{"cd": torch.arange(3.0), "one, truth": torch.ones(2, 3)}, {"cd": torch.zeros(1)}, {}]
+    for key, value in zip(keys[:2], values[:2], strict=True):
+        store.kept(tmp_path, key, lambda value=value: value)
+    store.pack(tmp_path)
+    assert not list((tmp_path / "metrics").iterdir())
+    store.kept(tmp_path, ["a", 3], lambda: {"cd": torch.full((2,), 7.0)})
+    store.pack(tmp_path)  # adds to what is packed
+    for key, value in zip(keys[:2], values[:2], strict=True):
+        found = store.kept(tmp_path, key, None)
+        assert list(found) == list(value) and all(found[name].equal(value[name]) for name in value)
+    assert store.kept(tmp_path, ["a", 3], None)["cd"].tolist() == [7, 7]
+    with pytest.raises(store.NotMeasured):
+        store.kept(tmp_path, ["a", 4], None)
