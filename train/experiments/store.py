@@ -14,6 +14,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from safetensors import safe_open
 from safetensors.torch import load_file, save
@@ -65,22 +66,28 @@ def kept(out: Path, key: Sequence[object], measure: Callable[[], Metrics] | None
     return found
 
 
+def keys(out: Path) -> dict[str, list[Any]]:
+    """KEY -> key of everything in the packed file of a directory."""
+    path = out / "metrics.safetensors"
+    return {name: json.loads(text) for name, text in _metadata(path).items()} if path.exists() else {}
+
+
 def pack(out: Path) -> None:
     """Moves all single measurements of a directory into its packed file. One process at a time may pack."""
     singles = sorted((out / "metrics").glob("*.safetensors"))
     if not singles:
         return
     target = out / "metrics.safetensors"
-    measured = dict(_packed(out))
-    keys = _metadata(target) if target.exists() else {}
+    measured, described = dict(_packed(out)), keys(out)
     for path in singles:
         measured[path.stem] = load_file(path)
-        keys[path.stem] = _metadata(path)["key"]
+        described[path.stem] = json.loads(_metadata(path)["key"])
     flat = {
         f"{name}/{metric}": measured[name][metric] for name in sorted(measured) for metric in measured[name]
     }
     with replacing(target) as temporary:
-        temporary.write_bytes(save(flat, metadata=dict(sorted(keys.items()))))
+        metadata = {name: json.dumps(key, sort_keys=True) for name, key in described.items()}
+        temporary.write_bytes(save(flat, metadata=metadata))
     for path in singles:
         path.unlink()
 
