@@ -127,7 +127,9 @@ def write_pid(folder: Path, number: int) -> None:
 
 def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     script = _KILLED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
-    with subprocess.Popen([sys.executable, "-c", script], cwd=REPOSITORY, stderr=subprocess.DEVNULL) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-c", script], cwd=REPOSITORY, stderr=subprocess.DEVNULL
+    ) as parent:
         while len(list(tmp_path.glob("*.pid"))) < 2:
             assert parent.poll() is None
             time.sleep(0.01)

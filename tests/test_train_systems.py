@@ -17,7 +17,7 @@ from models import Generator
 from models.baselines import Baseline, StructureGenerator, fixed_cameras, surface_points
 from train.__main__ import main
 from train.config import PROFILES, StageConfig, System, fit_config_from_json, to_json, with_steps
-from train.data.batches import LoadedSplit, Truth, load_split
+from train.data.batches import LoadedSplit, Targets, load_split
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate
 from train.evaluation.inference import reconstruct
@@ -96,10 +96,10 @@ def test_settings_of_our_own_system_are_refused(
 # --- what the lessons are taught with
 
 
-def _sphere(radius: float, *, eyes: torch.Tensor) -> Truth:
+def _sphere(radius: float, *, eyes: torch.Tensor) -> Targets:
     directions = torch.nn.functional.normalize(torch.randn(1, 30_000, 3), dim=-1)
     camera = PinholeCamera.look_at(eyes[None], focal_px=105.0, height=56, width=56)
-    return Truth(radius * directions, splat_depth(radius * directions, camera, radius=1.0).depth, camera)
+    return Targets(radius * directions, splat_depth(radius * directions, camera, radius=1.0).depth, camera)
 
 
 _AROUND = torch.tensor([[2.0, 0, 0], [-2, 0, 0], [0, 0.3, 2], [0, 0.3, -2], [0.1, 2, 0], [0.1, -2, 0]])
@@ -121,7 +121,7 @@ def test_cells_are_filled_to_the_surface_and_not_beyond() -> None:
 def test_cells_of_a_thin_plate_and_of_corners_that_no_view_sees() -> None:
     plate = torch.rand(1, 4000, 3) * torch.tensor([0.6, 0.6, 0.0]) - torch.tensor([0.3, 0.3, 0.01])
     camera = PinholeCamera.look_at(_AROUND[None, 2:4], focal_px=40.0, height=16, width=16)
-    cells = solid_cells(Truth(plate, splat_depth(plate, camera).depth, camera), 16)
+    cells = solid_cells(Targets(plate, splat_depth(plate, camera).depth, camera), 16)
     filled = cells[0].nonzero()
     assert filled[:, 2].unique().tolist() == [7]
     assert len(filled) >= 0.9 * (0.6 * 16) ** 2
@@ -132,7 +132,7 @@ def test_silhouettes_fill_a_hollow_that_a_view_looks_into() -> None:
     directions = torch.nn.functional.normalize(torch.randn(1, 30_000, 3), dim=-1)
     bowl = 0.3 * torch.cat([directions[..., :1], -directions[..., 1:2].abs(), directions[..., 2:]], -1)
     camera = PinholeCamera.look_at(_AROUND[None], focal_px=105.0, height=56, width=56)
-    truth = Truth(bowl, splat_depth(bowl, camera, radius=1.0).depth, camera)
+    truth = Targets(bowl, splat_depth(bowl, camera, radius=1.0).depth, camera)
     solid, hull = solid_cells(truth, 16), hull_cells(truth, 16)
     x, y, z = torch.cartesian_prod(*[(torch.arange(16) + 0.5) / 16 - 0.5] * 3).T.reshape(3, 1, 16, 16, 16)
     from_middle = torch.stack([x, y, z]).norm(dim=0)
@@ -150,7 +150,7 @@ def test_a_lesson_learnt_without_an_error_comes_near_the_truth(system: System, t
     network, split, ideal = build_network(config), _split(tiny_data, system, limit=4), METHODS[system].ideal
     shapes = torch.arange(len(split))
     assert ideal is not None
-    taught = compare(ideal(network, split.truth(shapes)), split.points, points=network.points)
+    taught = compare(ideal(network, split.targets(shapes)), split.points, points=network.points)
     fresh = score(network, split, config.inference, views=2, seed=0)
     assert (taught["cd"] < 0.6 * fresh["cd"]).all()
     if system != "ptn":  # a hull of these data's few views goes far beyond the surface
@@ -191,9 +191,11 @@ def test_one_batch_can_be_learnt_by_heart(system: System, steps: int, left: floa
         assert isinstance(stage, StageConfig)
         stage = dataclasses.replace(stage, steps=steps, learning_rate=2e-3, final_learning_rate=1e-3)
         batch, chance = training._draw(stage)
-        assert batch.truth is not None
+        assert batch.targets is not None
         losses = [
-            taught_step(learner, Given(batch, batch.truth, chance.codes, stage, step), lesson)["loss"].item()
+            taught_step(learner, Given(batch, batch.targets, chance.codes, stage, step), lesson)[
+                "loss"
+            ].item()
             for step in range(steps)
         ]
         if phase == "stage1":
@@ -207,10 +209,10 @@ def test_one_batch_can_be_learnt_by_heart(system: System, steps: int, left: floa
 def test_only_the_nearest_of_the_codes_clouds_learns(tiny_data: Path) -> None:
     training = Training(with_system(_SMOKE, "psgn-mon"), _split(tiny_data, "psgn-mon"))
     batch, chance = training._draw(training.config.stage1)
-    assert batch.truth is not None
+    assert batch.targets is not None
     generator = training.learner.generator
     codes = chance.codes.clone().requires_grad_()
-    given = Given(batch, batch.truth, codes, training.config.stage1, 0)
+    given = Given(batch, batch.targets, codes, training.config.stage1, 0)
     report = METHODS["psgn-mon"].lessons["stage1"](generator, given)
     assert report["loss"] < report["mean_of_all"]
     (gradient,) = torch.autograd.grad(report["loss"], codes)

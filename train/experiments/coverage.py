@@ -20,11 +20,11 @@ from tqdm import tqdm
 from diffpoint import PinholeCamera, nearest
 from models import Predictor
 from train.config import FitConfig
-from train.data import ShapeTree, store
+from train.data import ShapeTree, tree_files
+from train.data.ambiguity_check import AmbiguousObject, ambiguous_object
 from train.data.families import FAMILIES
 from train.data.procedural import variants_of
 from train.data.render import Renderer, orbit_camera
-from train.data.rules import Hider, hider_of
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
 from train.evaluation.per_shape import Scores, stacked
@@ -88,7 +88,7 @@ def coverage(bench: Workbench) -> dict[str, Any]:
     bench.train_all(configs(bench))
     config = bench.config(as_it_is, seed=0)
     test = bench.split(config, "test")
-    hiders = [found for found in map(hider_of, test.ids) if found]
+    hiders = [found for found in map(ambiguous_object, test.ids) if found]
     if not hiders:
         raise UserError(
             f"{bench.scored_tree} has no test shape of a family with hidden backs; make some with: "
@@ -145,7 +145,7 @@ def _claims(rows: Mapping[str, Scores]) -> list[dict[str, Any]]:
     return [*reached, *wrong]
 
 
-def make_object(hider: Hider, size: int) -> Object:
+def make_object(hider: AmbiguousObject, size: int) -> Object:
     """The object behind a shape of a tree, in a picture of its front of `size` pixels, drawn with the first back."""
     cone = FAMILIES[hider.category].cone
     assert cone is not None
@@ -155,7 +155,9 @@ def make_object(hider: Hider, size: int) -> Object:
     camera = orbit_camera(np.array([azimuth]), np.array([cone.elevation_deg]), size)
     views = Renderer(surface_of(variants[0])).render(camera)
     backs, again = (
-        torch.from_numpy(np.stack([sample_union(solids, store.POINTS, rng) for solids in variants])).float()
+        torch.from_numpy(
+            np.stack([sample_union(solids, tree_files.POINTS, rng) for solids in variants])
+        ).float()
         for _ in range(2)
     )
     image = torch.from_numpy(views.images[0]).permute(2, 0, 1).float() / 255
@@ -246,7 +248,13 @@ def _split_up(scores: Scores, counts: Sequence[int]) -> dict[int, Scores]:
 
 
 def _kept(
-    bench: Workbench, config: Any, hiders: list[Hider], needed: Any, *, codes: Sequence[int], seed: int
+    bench: Workbench,
+    config: Any,
+    hiders: list[AmbiguousObject],
+    needed: Any,
+    *,
+    codes: Sequence[int],
+    seed: int,
 ) -> dict[int, Scores]:
     def take() -> Scores:
         model = bench.network(config)
@@ -264,7 +272,7 @@ def answers(model: Predictor, image: Tensor, count: int, *, seed: int) -> Tensor
     return model(image[None], codes)[:, 0].contiguous()
 
 
-def _without_network(bench: Workbench, hiders: list[Hider], needed: Any) -> dict[str, Scores]:
+def _without_network(bench: Workbench, hiders: list[AmbiguousObject], needed: Any) -> dict[str, Scores]:
     """Random training shapes of the category, and samples of the backs themselves, as large as one prediction."""
     config = bench.config(as_it_is, seed=0)
 
@@ -340,7 +348,7 @@ def _cell(found: Mapping[str, Any], *, percent: bool) -> str:
     return f"{found['mean']:.0%}" + ("" if found["sd"] is None else f" ± {100 * found['sd']:.0f}")
 
 
-def _figure(bench: Workbench, hiders: list[Hider], size: int, result: Mapping[str, Any]) -> Figure:
+def _figure(bench: Workbench, hiders: list[AmbiguousObject], size: int, result: Mapping[str, Any]) -> Figure:
     """For one object of each family: the front, its backs, and what a few codes draw, all from one side behind."""
     chosen = list({hider.category: hider for hider in reversed(hiders)}.values())[::-1]
     model = bench.network(bench.config(as_it_is, seed=0))

@@ -122,7 +122,7 @@ def _perfectly_taught(row: Row, bench: Workbench, config: FitConfig) -> Scores:
     def measure(network: Predictor, test: LoadedSplit) -> Scores:
         parts = []
         for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
-            clouds = ideal(network, test.truth(shapes))
+            clouds = ideal(network, test.targets(shapes))
             parts.append(compare(clouds, test.points[shapes], points=network.points))
         return joined(parts)
 

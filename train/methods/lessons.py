@@ -22,7 +22,7 @@ from models.baselines import (
     silhouettes,
 )
 from train.config import StageConfig
-from train.data.batches import Batch, Truth
+from train.data.batches import Batch, Targets
 from train.methods.losses import TRANSPORT_TOLERANCE, arrange_scenes, front_loss
 from train.methods.targets import fixed_depth, solid_cells
 
@@ -45,7 +45,7 @@ class Given(NamedTuple):
     """
 
     batch: Batch
-    truth: Truth
+    truth: Targets
     codes: Tensor
     stage: StageConfig
     step: int

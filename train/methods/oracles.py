@@ -16,19 +16,19 @@ from models.baselines import (
     pixel_centres,
     surface_points,
 )
-from train.data.batches import Truth
+from train.data.batches import Targets
 from train.methods.targets import fixed_depth, hull_cells, solid_cells
 
-Ideal = Callable[[Any, Truth], Tensor]
+Ideal = Callable[[Any, Targets], Tensor]
 """(network, truth of B shapes) -> (B, N, 3) clouds in the world frame, as the network itself would state them."""
 
 
-def sampled_surface(network: Predictor, truth: Truth) -> Tensor:
+def sampled_surface(network: Predictor, truth: Targets) -> Tensor:
     """PSGN: as many points of the surface as it has."""
     return truth.points[:, : network.points].contiguous()
 
 
-def fused_maps(network: StructureGenerator, truth: Truth) -> Tensor:
+def fused_maps(network: StructureGenerator, truth: Targets) -> Tensor:
     """Lin et al.: the maps of the eight fixed cameras, put together."""
     size = network.config.map_size
     depth = fixed_depth(truth.points, size)
@@ -36,12 +36,12 @@ def fused_maps(network: StructureGenerator, truth: Truth) -> Tensor:
     return network.answer_of(Structure(pixels, depth, logits=depth.isfinite().to(depth) - 0.5))
 
 
-def true_cells(network: RecurrentReconstruction, truth: Truth) -> Tensor:
+def true_cells(network: RecurrentReconstruction, truth: Targets) -> Tensor:
     """3D-R2N2: the faces of the cells that a shape fills."""
     return surface_points(solid_cells(truth, network.grid_size).float(), network.points, threshold=0.5)
 
 
-def hull(network: SilhouetteReconstruction, truth: Truth) -> Tensor:
+def hull(network: SilhouetteReconstruction, truth: Targets) -> Tensor:
     """PTN: the faces of all that the silhouettes leave."""
     cells = network.inside * hull_cells(truth, network.grid_size)
     return surface_points(cells, network.points, threshold=0.5)

@@ -7,13 +7,13 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, project, splat_depth
 from models.baselines import cell_centres, fixed_cameras
-from train.data.batches import Truth
+from train.data.batches import Targets
 
 # World units: the gaps between the 2048 points of a surface are closed, and outlines grow by no more than this.
 _POINT_RADIUS = 0.01
 
 
-def solid_cells(truth: Truth, size: int) -> Tensor:
+def solid_cells(truth: Targets, size: int) -> Tensor:
     """Which cells of the cube [-0.5, 0.5]^3 a shape fills: (B, G, G, G) bool, along x, y and z.
 
     A cell is empty when some view sees its centre lying before the surface or before nothing, or when its centre lies
@@ -28,7 +28,7 @@ def solid_cells(truth: Truth, size: int) -> Tensor:
         >>> eyes = torch.tensor([[[0.0, 0, -2], [0, 0, 2], [2, 0, 0], [-2, 0, 0]]])
         >>> camera = PinholeCamera.look_at(eyes, focal_px=40.0, height=32, width=32)
         >>> cube = torch.cartesian_prod(*[torch.linspace(-0.24, 0.24, 40)] * 3)[None]
-        >>> cells = solid_cells(Truth(cube, splat_depth(cube, camera).depth, camera), 8)
+        >>> cells = solid_cells(Targets(cube, splat_depth(cube, camera).depth, camera), 8)
         >>> cells[0, :, 4, 4].int().tolist()
         [0, 0, 1, 1, 1, 1, 0, 0]
     """
@@ -45,7 +45,7 @@ def solid_cells(truth: Truth, size: int) -> Tensor:
     return (filled | holds_point).unflatten(1, (size, size, size))
 
 
-def hull_cells(truth: Truth, size: int) -> Tensor:
+def hull_cells(truth: Targets, size: int) -> Tensor:
     """Which cells of the cube [-0.5, 0.5]^3 no silhouette rules out: (B, G, G, G) bool, along x, y and z.
 
     A cell is left out when some view has an empty pixel where its centre is. This is the most that silhouettes say:
@@ -59,14 +59,14 @@ def hull_cells(truth: Truth, size: int) -> Tensor:
         >>> camera = PinholeCamera.look_at(torch.tensor([[[0.0, 0, -9]]]), focal_px=288.0, height=32, width=32)
         >>> depth = torch.full((1, 1, 32, 32), torch.inf)
         >>> depth[..., 8:24] = 9.0  # a wall: nothing is known of how thick it is
-        >>> hull_cells(Truth(torch.zeros(1, 1, 3), depth, camera), 8)[0, :, 4].int().tolist()[1:3]
+        >>> hull_cells(Targets(torch.zeros(1, 1, 3), depth, camera), 8)[0, :, 4].int().tolist()[1:3]
         [[0, 0, 0, 0, 0, 0, 0, 0], [1, 1, 1, 1, 1, 1, 1, 1]]
     """
     inside, _, surface = _seen_at(cell_centres(size).to(truth.points), truth)
     return (surface.isfinite() | ~inside).all(1).unflatten(1, (size, size, size))
 
 
-def _seen_at(centres: Tensor, truth: Truth) -> tuple[Tensor, Tensor, Tensor]:
+def _seen_at(centres: Tensor, truth: Targets) -> tuple[Tensor, Tensor, Tensor]:
     """(C, 3) places in the world -> (B, V, C) of each view: is a place in its picture, how deep is it, and the depth
     of what the picture shows there."""
     _, _, height, width = truth.depth.shape

@@ -121,12 +121,12 @@ class Training:
         else:
             batch, chance = self._draw(phase)
             laps.stop("data")
-            if batch.truth is None:
+            if batch.targets is None:
                 report = training_step(
                     self.learner, batch, chance, phase, step=self.step, laps=laps, world=self._world
                 )
             else:
-                given = Given(batch, batch.truth, chance.codes, phase, self.step)
+                given = Given(batch, batch.targets, chance.codes, phase, self.step)
                 lesson = METHODS[self.config.system].lessons[self.phase_name]
                 report = taught_step(self.learner, given, lesson, laps=laps, world=self._world)
         laps.end_step()
@@ -162,7 +162,7 @@ class Training:
             real = [self._clouds(shapes), *(self._draw_clouds(stage.shapes) for _ in range(stage.real_pool))]
             batch = batch._replace(real=share(torch.stack(real), 1))
         if self.config.system != "ours":
-            batch = batch._replace(truth=self._train.truth(share(shapes)))
+            batch = batch._replace(targets=self._train.targets(share(shapes)))
         return batch, Chance(share(codes, 1), share(mix, -1))
 
     def networks(self) -> dict[str, nn.Module]:
