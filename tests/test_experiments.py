@@ -135,7 +135,9 @@ def test_an_interrupted_training_is_finished_to_the_same_weights(trained: Study)
 
 
 def test_trainings_share_a_stage_1(fresh: Study) -> None:
-    plain, other = (fresh.config(change, seed=0) for change in (without_critic, second_stage_without_diversity))
+    plain, other = (
+        fresh.config(change, seed=0) for change in (without_critic, second_stage_without_diversity)
+    )
     other = dataclasses.replace(other, stage1=plain.stage1)
     other = dataclasses.replace(other, stage2=dataclasses.replace(plain.stage2, beta=0.0))
     first, second = parts_of(plain), parts_of(other)
@@ -179,14 +181,22 @@ def test_an_interval_is_of_shapes_and_of_trainings() -> None:
     found = claim("a < b", 1 + noise, paper_gain=0.5)
     low, high = found["interval"]
     # The mean of 400 shapes varies by 1.96 / 20; three trainings on the same shapes with independent noise by less.
-    assert found["gain"] == pytest.approx(1) and 0.05 < 1 - low < 0.12 and high - 1 == pytest.approx(1 - low, abs=0.01)
+    assert (
+        found["gain"] == pytest.approx(1)
+        and 0.05 < 1 - low < 0.12
+        and high - 1 == pytest.approx(1 - low, abs=0.01)
+    )
     assert found["verdict"] == "holds"
     assert claim("", -1 - noise)["verdict"] == "does not hold" and claim("", noise)["verdict"] == "undecided"
     # Trainings that disagree leave a doubt, however many shapes there are.
     disagree = noise * 1e-3 + np.array([[1.0], [1.0], [-1.5]])
     assert claim("", disagree)["verdict"] == "undecided"
     assert resampled_means(disagree).std() > 0.5
-    assert [verdict(*each) for each in ((0.1, 1), (-1, -0.1), (-1, 1))] == ["holds", "does not hold", "undecided"]
+    assert [verdict(*each) for each in ((0.1, 1), (-1, -0.1), (-1, 1))] == [
+        "holds",
+        "does not hold",
+        "undecided",
+    ]
     assert counted([found] * 2).startswith("2 claims are tested: 2 hold, 0 do not hold, 0 are undecided")
 
 
@@ -195,7 +205,10 @@ def test_an_interval_is_of_shapes_and_of_trainings() -> None:
 
 @pytest.mark.parametrize("name", [name for name in TABLES if name != "critic"])
 def test_every_table_of_the_paper_is_what_was_measured(name: str, trained: Study) -> None:
-    table, study = few_views(TABLES[name]), dataclasses.replace(trained, seeds=2 if name == "deterministic" else 1)
+    table, study = (
+        few_views(TABLES[name]),
+        dataclasses.replace(trained, seeds=2 if name == "deterministic" else 1),
+    )
     result = make_experiment(name, table.experiment, study)
     assert json.loads((study.out / f"{name}.json").read_text()) == json.loads(json.dumps(result))
     assert list(result["rows"]) == [row.name for row in table.rows]
