@@ -347,7 +347,7 @@ def test_a_training_starts_with_the_weights_of_another(
     assert "does not exist" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
     # A run that has begun does not need them any more.
-    copy = shutil.copy(start, tmp_path / "start.safetensors")
+    copy = Path(shutil.copy(start, tmp_path / "start.safetensors"))
     assert main([*fit_it, str(copy), "--out", str(tmp_path / "run")]) == 0
     copy.unlink()
     shutil.rmtree(_newest(tmp_path / "run"))
