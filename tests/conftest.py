@@ -12,7 +12,7 @@ import pytest
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """How many cases the property tests threw."""
+    """Prints the number of cases of the property tests."""
     passed = terminalreporter.stats.get("passed", [])
     cases = sum(value for report in passed for name, value in report.user_properties if name == "cases")
     if cases:
