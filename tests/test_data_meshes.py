@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 
 from train.data import ShapeTree, tree_files
-from train.data.mesh_files import MeshError, load_surface
+from train.data.mesh_files import load_surface
 from train.data.mesh_sources import (
     UPRIGHT,
     MeshFile,
@@ -27,6 +27,7 @@ from train.data.visible_samples import sample_visible
 from train.errors import UserError
 
 SMALL = {"size": 32, "views": 2, "processes": 1}
+BOX = trimesh.creation.box((1.0, 2.0, 3.0))
 SHIPPED = Path(__file__).parents[1] / "train" / "data" / "furniture_labels.csv"
 
 
@@ -40,40 +41,52 @@ def all_shapes(root):
     return [shape for split in tree_files.SPLITS for shape in ShapeTree(root, split).iter_valid()]
 
 
+BAD = {  # name -> content, and what is said of it
+    "text.obj": ("Dear Sir or Madam,\nthis is a letter.\n", ""),
+    "no faces.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
+    "nan.obj": ("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN"),
+    "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no area"),
+    "point.obj": ("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no extent"),
+    "triangle.obj": ("v 0 0 0\nv 1 0.3 0.2\nv 0 1 0.5\nf 1 2 3\n", "flat: all its faces lie in one plane"),
+    "index.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", ""),
+    "empty.glb": (b"", "cannot be read"),
+    "noise.ply": (np.random.default_rng(0).bytes(500), "cannot be read"),
+}
+
+
 def bad_meshes(folder):
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "text.obj").write_text("Dear Sir or Madam,\nthis is a letter.\n")
-    (folder / "no faces.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    (folder / "nan.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    (folder / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
-    (folder / "point.obj").write_text("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n")
-    (folder / "index.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
-    (folder / "empty.glb").write_bytes(b"")
-    (folder / "noise.ply").write_bytes(np.random.default_rng(0).bytes(500))
-    return sorted(path.name for path in folder.iterdir())
+    """Each of them, a mesh thinner than a pixel, and one that is too large to be opened."""
+    folder.mkdir(parents=True)
+    for name, (content, _) in BAD.items():
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    save_box(folder / "needle.obj", (1.0, 0.0002, 0.0002))
+    with (folder / "huge.ply").open("wb") as file:
+        file.truncate(300 << 20)  # a hole: no space is taken
+    said = {name: reason for name, (_, reason) in BAD.items()}
+    return said | {"needle.obj": "shows nothing: the mesh is too thin", "huge.ply": "larger than 256 MB"}
 
 
 def test_good_ones_are_made_and_each_bad_one_is_named(tmp_path):
-    names = bad_meshes(tmp_path / "in" / "chairs")
+    said = bad_meshes(tmp_path / "in" / "chairs")
     for suffix in ("obj", "glb", "ply", "off", "stl"):
         save_box(tmp_path / "in" / "chairs" / f"box.{suffix}")
-    save_box(tmp_path / "in" / "Möbel und mehr" / "стул 1.obj")
-    report = convert([tmp_path / "in"], tmp_path / "out", **SMALL)
+    save_box(tmp_path / "in" / "Möbel und mehr" / "стул 1.obj", (1.0, 2.0, 0.01))
+    report = convert([tmp_path / "in"], tmp_path / "out", size=16, views=4, processes=1)
     assert report.made == 6
-    assert sorted(failure.rpartition("/")[2] for failure in report.failures) == names
-    assert all(report.failures.values())
-    for name, reason in {
-        "nan.obj": "NaN",
-        "no faces.obj": "no faces",
-        "point.obj": "no extent",
-        "empty.glb": "cannot be read",
-    }.items():
-        assert reason in report.failures[f"in: chairs/{name}"]
+    assert report.failures.keys() == {f"in: chairs/{name}" for name in said}
+    for name, reason in said.items():
+        found = report.failures[f"in: chairs/{name}"]
+        assert found
+        assert reason in found
         assert name in report.summary()
     assert report.categories == {"chair": 5, "unknown": 1}
     shapes = all_shapes(tmp_path / "out")
     assert len({shape.id for shape in shapes}) == 6
     assert all(shape.id.isascii() and " " not in shape.id for shape in shapes)
+    with (tmp_path / "out" / LEFT_OUT).open(newline="") as file:
+        assert dict(csv.reader(file)) == report.failures | {"mesh": "reason"}
+    convert([tmp_path / "in" / "chairs" / "box.obj"], tmp_path / "out", size=16, views=4, processes=1)
+    assert not (tmp_path / "out" / LEFT_OUT).exists()
 
 
 def test_surface_is_centred_with_diagonal_one_and_turned(tmp_path):
@@ -213,12 +226,15 @@ def test_labels_choose_and_name(tmp_path):
             ("lib", "b/model.obj", "garden gnome", "", "A gnome"),
             ("lib", "gone/model.obj", "chair", "03001627", "Gone"),
             ("another library", "x.obj", "chair", "03001627", "Not asked for"),
+            ("", "c/model.obj", "lamp", "", "In any library"),
+            ("", "gone.obj", "lamp", "", "Gone from all"),
         ],
     )
     report = convert([tmp_path / "lib"], tmp_path / "out", labels=labels, **SMALL)
-    assert report.categories == {"chair": 1, "garden_gnome": 1}
-    assert list(report.failures) == ["lib: gone/model.obj"]
-    assert sorted(shape.id for shape in all_shapes(tmp_path / "out")) == ["03001627/a", "garden_gnome/b"]
+    assert report.categories == {"chair": 1, "garden_gnome": 1, "lamp": 1}
+    assert sorted(report.failures) == ["labels.csv: gone.obj", "lib: gone/model.obj"]
+    ids = sorted(shape.id for shape in all_shapes(tmp_path / "out"))
+    assert ids == ["03001627/a", "03636649/c", "garden_gnome/b"]
 
 
 def test_labels_that_fit_nothing_or_are_none(tmp_path):
@@ -254,41 +270,6 @@ def test_names_are_unique_even_where_letters_are_lost(tmp_path):
     ids = shape_ids(find_meshes([tmp_path], tmp_path / "none")[0])
     assert len({each.lower() for each in ids}) == 6
     assert all(each.isascii() for each in ids)
-
-
-def test_one_triangle_is_refused_as_flat_and_a_thin_board_is_not(tmp_path):
-    (tmp_path / "triangle.obj").write_text("v 0 0 0\nv 1 0.3 0.2\nv 0 1 0.5\nf 1 2 3\n")
-    with pytest.raises(MeshError, match="flat: all its faces lie in one plane"):
-        load_surface(tmp_path / "triangle.obj")
-    save_box(tmp_path / "board.obj", (1.0, 2.0, 0.001))
-    assert len(load_surface(tmp_path / "board.obj").faces) == 12
-
-
-def test_what_is_too_thin_for_its_pixels_is_named(tmp_path):
-    save_box(tmp_path / "in" / "needle.obj", (1.0, 0.0002, 0.0002))
-    save_box(tmp_path / "in" / "box.obj")
-    report = convert([tmp_path / "in"], tmp_path / "out", size=16, views=4, processes=1)
-    assert report.made == 1
-    assert "shows nothing: the mesh is too thin" in report.failures["in: needle.obj"]
-
-
-def test_a_file_that_is_too_large_is_not_even_opened(tmp_path):
-    with (tmp_path / "huge.ply").open("wb") as file:
-        file.truncate(300 << 20)  # a hole: no space is taken
-    with pytest.raises(MeshError, match="larger than 256 MB"):
-        load_surface(tmp_path / "huge.ply")
-
-
-def test_what_was_left_out_is_written_down(tmp_path):
-    bad = tmp_path / "in" / "bad, or not.obj"
-    save_box(tmp_path / "in" / "good.obj")
-    bad.write_text("nothing")
-    convert([tmp_path / "in"], tmp_path / "out", **SMALL)
-    with (tmp_path / "out" / LEFT_OUT).open(newline="") as file:
-        assert list(csv.reader(file)) == [["mesh", "reason"], ["in: bad, or not.obj", "no faces"]]
-    bad.unlink()
-    convert([tmp_path / "in"], tmp_path / "out", **SMALL)
-    assert not (tmp_path / "out" / LEFT_OUT).exists()
 
 
 def test_a_long_list_is_cut_on_the_terminal(tmp_path):
@@ -330,26 +311,19 @@ def test_a_second_run_adds_what_is_new_and_keeps_the_rest(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "labels", "message"),
     [
-        (MeshOptions(up="w"), "up must be one of y, z, x, -y"),
-        (MeshOptions(scale=0.0), "scale must be positive"),
-        (MeshOptions(orbit=Orbit(distance=1.0)), "the frame cuts shapes"),
+        (MeshOptions(up="w"), None, "up must be one of y, z, x, -y"),
+        (MeshOptions(scale=0.0), None, "scale must be positive"),
+        (MeshOptions(orbit=Orbit(distance=1.0)), None, "the frame cuts shapes"),
+        (MeshOptions(category="chair"), "x.csv", "give one of them"),
     ],
 )
-def test_options_that_cannot_be_are_refused(tmp_path, options, message):
+def test_options_that_cannot_be_are_refused(tmp_path, options, labels, message):
     save_box(tmp_path / "a.obj")
     with pytest.raises(UserError, match=message):
-        convert([tmp_path / "a.obj"], tmp_path / "out", options=options, **SMALL)
+        convert(tmp_path / "a.obj", tmp_path / "out", labels=labels, options=options, **SMALL)
     assert not (tmp_path / "out").exists()
-
-
-def test_labels_and_category_are_one_too_many(tmp_path):
-    save_box(tmp_path / "a.obj")
-    with pytest.raises(UserError, match="give one of them"):
-        convert(
-            [tmp_path], tmp_path / "out", labels=tmp_path / "x.csv", options=MeshOptions(category="chair")
-        )
 
 
 def test_the_up_axis_and_the_cameras_reach_the_views(tmp_path):
@@ -415,9 +389,6 @@ def test_hidden_points_without_embree(tmp_path):
     camera = draw_camera(np.random.default_rng(0), 2, 64)
     points = sample_visible(renderer, camera, 300, np.random.default_rng(0))
     np.testing.assert_allclose(np.abs(points).max(1), 0.5 / np.sqrt(3), atol=1e-6)
-
-
-BOX = trimesh.creation.box((1.0, 2.0, 3.0))
 
 
 def save_textured(folder, name, images):
@@ -520,17 +491,6 @@ def test_a_category_for_all(tmp_path, category, synset):
     BOX.export(tmp_path / "tables" / "x.off")
     meshes, _ = find_meshes([tmp_path], tmp_path)
     assert [mesh.synset for mesh in of_category(meshes, category)] == [synset]
-
-
-def test_labels_without_a_library_fit_any(tmp_path):
-    for folder in ("one", "two"):
-        (tmp_path / folder).mkdir()
-        BOX.export(tmp_path / folder / "x.off")
-    (tmp_path / "labels.csv").write_text("model,category\nx.off,lamp\ngone.off,lamp\n")
-    meshes, _ = find_meshes([tmp_path / "one", tmp_path / "two"], tmp_path)
-    kept, absent = keep_labelled(meshes, read_labels(tmp_path / "labels.csv"), tmp_path / "labels.csv")
-    assert [(mesh.library, mesh.synset) for mesh in kept] == [("one", "03636649"), ("two", "03636649")]
-    assert list(absent) == ["labels.csv: gone.off"]
 
 
 def test_each_axis_is_turned_up_and_none_is_mirrored(tmp_path):

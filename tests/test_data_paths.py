@@ -14,7 +14,6 @@ from PIL import Image
 
 import train.data
 from train.data import ShapeTree
-from train.data.ambiguity_check import measure_tree
 from train.data.batches import load_split
 from train.data.cache import damaged_files, prepare
 from train.data.check import check_tree
@@ -42,7 +41,6 @@ CALLS = {
     "prepare": lambda p, at: list(prepare(p(at / "data"), shapes(at), Sizes((16, 16), 16), progress=False)),
     "damaged_files": lambda p, at: damaged_files(p(at / "data")),
     "check_tree": lambda p, at: check_tree(p(at / "data")).problems,
-    "measure_tree": lambda p, at: measure_tree(p(at / "data")).broken,
     "read_shape": lambda p, at: read_shape(p(at / "data"), shapes(at)[0]).id,
     "frame_of": lambda p, at: frame_of(p(at / "data")).verdict,
     "layout_of": lambda p, at: layout_of(p(at / "data")).on_disk(),

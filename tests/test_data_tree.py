@@ -156,6 +156,10 @@ def truncate(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def edit(path, **changes):
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
 BREAKAGES = {
     "truncated image": ("render_1.png", truncate),
     "empty depth": ("depth_0.png", lambda path: path.write_bytes(b"")),
@@ -164,6 +168,9 @@ BREAKAGES = {
     "missing depth": ("depth_1.png", lambda path: path.unlink()),
     "broken json": ("camera_0.json", lambda path: path.write_text('{"K": [[1')),
     "no camera": ("camera_0.json", lambda path: path.write_text('{"K": [[1]], "cam_from_world": [[NaN]]}')),
+    "no focal length": ("camera_0.json", lambda path: edit(path, K=[[0, 0, 8], [0, 0, 8], [0, 0, 1]])),
+    "no pose": ("camera_0.json", lambda path: edit(path, cam_from_world=np.diag([1, 0, 1, 1]).tolist())),
+    "mirror": ("camera_0.json", lambda path: edit(path, cam_from_world=np.diag([1, -1, 1, 1]).tolist())),
     "lacking key": ("camera_0.json", lambda path: path.write_text("{}")),
     "missing camera": ("camera_0.json", lambda path: path.unlink()),
     "truncated cloud": ("ply", truncate),
