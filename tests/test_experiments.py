@@ -14,7 +14,7 @@ from models import build_generator
 from train.config import InferenceConfig
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate
-from train.evaluation.per_shape import Scores, score
+from train.evaluation.per_shape import ShapeMetrics, evaluate_split
 from train.experiments.agreement import WAYS, agreement
 from train.experiments.run import EXPERIMENTS, Workbench, run_experiment
 from train.methods.weights import save_weights
@@ -54,14 +54,14 @@ def test_agreement_goes_on_where_it_was(
 ) -> None:
     scored: list[object] = []
 
-    def counted(*args: object, **settings: object) -> Scores:
+    def counted(*args: object, **settings: object) -> ShapeMetrics:
         scored.append(settings)
         if len(scored) == 3:
             raise KeyboardInterrupt
-        return score(*args, **settings)
+        return evaluate_split(*args, **settings)
 
     module = importlib.import_module("train.experiments.agreement")
-    monkeypatch.setattr(module, "score", counted)
+    monkeypatch.setattr(module, "evaluate_split", counted)
     monkeypatch.setattr(module, "_GROUPS", 2)
     bench = Workbench((tiny_data,), tmp_path, "smoke", seeds=1, limit=2, progress=False)
     with pytest.raises(KeyboardInterrupt):

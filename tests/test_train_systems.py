@@ -21,7 +21,7 @@ from train.data.batches import LoadedSplit, Truth, load_split
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate
 from train.evaluation.inference import reconstruct
-from train.evaluation.per_shape import compare, score
+from train.evaluation.per_shape import compare_clouds, evaluate_split
 from train.evaluation.runs import config_of, latest_checkpoint, load_generator, load_predictor, read_metrics
 from train.methods.lessons import Given
 from train.methods.recipes import with_system
@@ -150,8 +150,8 @@ def test_a_lesson_learnt_without_an_error_comes_near_the_truth(system: System, t
     network, split, ideal = build_network(config), _split(tiny_data, system, limit=4), METHODS[system].ideal
     shapes = torch.arange(len(split))
     assert ideal is not None
-    taught = compare(ideal(network, split.truth(shapes)), split.points, points=network.points)
-    fresh = score(network, split, config.inference, views=2, seed=0)
+    taught = compare_clouds(ideal(network, split.truth(shapes)), split.points, points=network.points)
+    fresh = evaluate_split(network, split, config.inference, views=2, seed=0)
     assert (taught["cd"] < 0.6 * fresh["cd"]).all()
     if system != "ptn":  # a hull of these data's few views goes far beyond the surface
         cell = 100 / 16  # the smallest grids and maps have 16 to the world's unit
@@ -327,23 +327,23 @@ def test_predictions_of_several_views_are_scored_one_by_one(tiny_data: Path) -> 
     split = _split(tiny_data, "ptn", limit=3)
     config = with_system(_SMOKE, "ptn")
     network = METHODS["ptn"].build("smoke")
-    each = score(network, split, config.inference, views=3, seed=0)
+    each = evaluate_split(network, split, config.inference, views=3, seed=0)
     joined_settings = dataclasses.replace(config.inference, scored="joined")
-    joined = score(network, split, joined_settings, views=3, seed=0)
+    joined = evaluate_split(network, split, joined_settings, views=3, seed=0)
     found = reconstruct(network, split.float_images(torch.arange(3), torch.arange(3).expand(3, -1)))
     assert found.points.shape == (3, 3 * network.points, 3)
     assert found.codes.shape == (3, 3, 0)
     assert (each["best_cd"] <= each["cd"]).all()
     assert "best_cd" not in joined
     assert (joined["gt_to_pred"] < each["gt_to_pred"]).all()  # three times the points
-    one = score(network, split, config.inference, views=1, seed=0)
+    one = evaluate_split(network, split, config.inference, views=1, seed=0)
     torch.testing.assert_close(one["best_cd"], one["cd"])
 
 
 def test_a_network_that_reads_views_together_has_nothing_to_disagree_about(tiny_data: Path) -> None:
     split = _split(tiny_data, "r2n2", limit=2)
     network = METHODS["r2n2"].build("smoke")
-    scores = score(network, split, with_system(_SMOKE, "r2n2").inference, views=3, seed=0)
+    scores = evaluate_split(network, split, with_system(_SMOKE, "r2n2").inference, views=3, seed=0)
     assert "consistency" not in scores
     assert scores["cd"].shape == (2,)
 
@@ -360,6 +360,6 @@ def test_dense_answers_are_thinned_to_the_size_of_the_others(tiny_data: Path) ->
     index = farthest_point_sample(answer, network.points)
     thinned = torch.take_along_dim(answer, index[..., None], 1)
     both = chamfer_distance(thinned, split.points[:1], squared=False)
-    scores = score(network, split, with_system(_SMOKE, "lin").inference, views=1, seed=0)
+    scores = evaluate_split(network, split, with_system(_SMOKE, "lin").inference, views=1, seed=0)
     assert scores["fps_cd"].item() > scores["cd"].item() - 1e-3
     assert 100 * (both.a_to_b + both.b_to_a).item() > 0

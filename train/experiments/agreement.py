@@ -26,7 +26,14 @@ from diffpoint import consistency_loss
 from train.config import InferenceConfig
 from train.data.batches import LoadedSplit
 from train.errors import UserError
-from train.evaluation.per_shape import Scores, joined, means, score, spreads, stacked
+from train.evaluation.per_shape import (
+    ShapeMetrics,
+    concatenate,
+    evaluate_split,
+    mean_metrics,
+    stack_seeds,
+    std_over_seeds,
+)
 from train.evaluation.runs import open_run
 from train.experiments.correlation import pearson
 from train.experiments.table import table_row
@@ -114,8 +121,8 @@ def agreement(
     # In one process nothing is kept yet: it is measured here.
     bar = tqdm(everything, desc="ways of choosing codes", unit="measurement", disable=not bench.progress)
     found = {asked: _measured(bench, run, asked) for asked in bar}
-    scores = {name: joined([found[asked] for asked in each]) for name, each in of_ways.items()}
-    groups = joined([found[asked] for asked in of_groups])
+    scores = {name: concatenate([found[asked] for asked in each]) for name, each in of_ways.items()}
+    groups = concatenate([found[asked] for asked in of_groups])
 
     result: dict[str, Any] = bench.about(config) | {
         "profile": config.profile,  # the run's, whatever the bench would train
@@ -127,8 +134,8 @@ def agreement(
         "ways": {
             name: {
                 "settings": dataclasses.asdict(ways[name]),
-                "mean": means(found),
-                "sd_over_seeds": spreads(found),
+                "mean": mean_metrics(found),
+                "sd_over_seeds": std_over_seeds(found),
                 "against_random": _against(found, scores[_RANDOM]),
                 "lowered_share": _lowered(found) if ways[name].steps else None,
                 "code_norm": found["code_norm"].mean().item(),
@@ -141,17 +148,18 @@ def agreement(
     return result
 
 
-def _measured(bench: Workbench, run: Path, asked: _Asked) -> Scores:
+def _measured(bench: Workbench, run: Path, asked: _Asked) -> ShapeMetrics:
     """Figure -> (C, M) for each draw of codes and each shape, taken now or kept."""
     opened = open_run(run)
     test = bench.split(opened.config, "test")
     settings, views, seed, code_seeds = asked
 
-    def take() -> Scores:
+    def take() -> ShapeMetrics:
         draws = [
-            score(opened.model, test, settings, views=views, seed=seed, code_seed=draw) for draw in code_seeds
+            evaluate_split(opened.model, test, settings, views=views, seed=seed, code_seed=draw)
+            for draw in code_seeds
         ]
-        return {name: values.double() for name, values in stacked(draws).items()}
+        return {name: values.double() for name, values in stack_seeds(draws).items()}
 
     # A run's name would not do: any run can be asked about, and one that trains on gets other weights.
     weights = hashlib.sha256()
@@ -181,7 +189,7 @@ def _floor(test: LoadedSplit, *, points: int, clouds: int) -> float:
     return 100 * consistency_loss(shuffled[:, : clouds * points].unflatten(1, (clouds, points))).item()
 
 
-def _against(found: Scores, random: Scores) -> dict[str, dict[str, float]]:
+def _against(found: ShapeMetrics, random: ShapeMetrics) -> dict[str, dict[str, float]]:
     """Change against random codes: mean, and standard error over shapes."""
     changes = {name: (found[name] - random[name]).double().mean(0) for name in _COLUMNS}
     return {
@@ -190,11 +198,11 @@ def _against(found: Scores, random: Scores) -> dict[str, dict[str, float]]:
     }
 
 
-def _lowered(found: Scores) -> float:
+def _lowered(found: ShapeMetrics) -> float:
     return (found["consistency"] < found["searched"]).double().mean().item()
 
 
-def _correlation(groups: Scores) -> dict[str, dict[str, float]]:
+def _correlation(groups: ShapeMetrics) -> dict[str, dict[str, float]]:
     """Pearson's r of the consistency loss with each error: over groups within a shape, and over shapes."""
 
     disagreement = groups["consistency"].double()
@@ -241,7 +249,7 @@ def _markdown(result: dict[str, Any]) -> str:
     return "\n".join([head, "", *lines, "", *correlations, ""])
 
 
-def _figure(result: dict[str, Any], groups: Scores) -> Figure:
+def _figure(result: dict[str, Any], groups: ShapeMetrics) -> Figure:
     """Left: what each way does to the error and to the disagreement. Right: both over random groups of codes."""
     figure = Figure(figsize=(12, 4.8), layout="constrained", dpi=110)
     left, right = figure.subplots(1, 2)

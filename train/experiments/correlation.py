@@ -16,7 +16,7 @@ from scipy.stats import rankdata
 from torch import Tensor
 
 from train.config import InferenceConfig
-from train.evaluation.per_shape import Scores, stacked
+from train.evaluation.per_shape import ShapeMetrics, stack_seeds
 from train.experiments.table import NAMES, table_lines, trainings, verdict
 from train.experiments.workbench import Workbench, as_it_is
 from train.show import figures
@@ -47,7 +47,9 @@ def correlation(bench: Workbench) -> dict[str, Any]:
     seeds = range(bench.seeds)
     bench.measure_all(_measured, [(seed, views, group) for seed in seeds for group in (None, *range(GROUPS))])
     agreed = [_measured(bench, seed, views, None) for seed in seeds]
-    groups = [stacked([_measured(bench, seed, views, group) for group in range(GROUPS)]) for seed in seeds]
+    groups = [
+        stack_seeds([_measured(bench, seed, views, group) for group in range(GROUPS)]) for seed in seeds
+    ]
     result = bench.about(bench.config(as_it_is, seed=0)) | {
         "shapes": agreed[0]["cd"].shape[0],
         "views": views,
@@ -65,7 +67,7 @@ def correlation(bench: Workbench) -> dict[str, Any]:
     return result
 
 
-def _measured(bench: Workbench, seed: int, views: int, group: int | None) -> Scores:
+def _measured(bench: Workbench, seed: int, views: int, group: int | None) -> ShapeMetrics:
     """A training's figures with a group of random codes, or, without a number, with the codes that are agreed on."""
     config = bench.config(as_it_is, seed=seed)
     if group is None:
@@ -128,7 +130,7 @@ def within_shapes(coefficient: Measure, disagreement: Tensor, error: Tensor) -> 
 
 
 def _correlations(
-    by_seed: list[Scores], measured: Callable[[Measure, Tensor, Tensor], float], *, least: float
+    by_seed: list[ShapeMetrics], measured: Callable[[Measure, Tensor, Tensor], float], *, least: float
 ) -> dict[str, dict[str, Any]]:
     """Error -> coefficient -> figures; shapes are the last dimension of all scores."""
     found: dict[str, dict[str, Any]] = {}
@@ -149,7 +151,7 @@ def _correlations(
 
 
 def _bootstrap(
-    by_seed: list[Scores],
+    by_seed: list[ShapeMetrics],
     error: str,
     coefficient: Measure,
     measured: Callable[[Measure, Tensor, Tensor], float],
@@ -202,7 +204,7 @@ def _cell(found: Mapping[str, Any]) -> str:
     return f"{found['mean']:+.2f}{spread} ({low:+.2f} to {high:+.2f}; {found['confidence']:.0%})"
 
 
-def _figure(result: Mapping[str, Any], agreed: Scores, groups: Scores) -> Figure:
+def _figure(result: Mapping[str, Any], agreed: ShapeMetrics, groups: ShapeMetrics) -> Figure:
     """The first training's scatter: every shape; and the groups of every shape, of which a few are coloured."""
     figure = Figure(figsize=(12.5, 5.2), layout="constrained", dpi=110)
     left, right = figure.subplots(1, 2)

@@ -27,7 +27,7 @@ from train.data.render import Renderer, orbit_camera
 from train.data.rules import Hider, hider_of
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
-from train.evaluation.per_shape import Scores, stacked
+from train.evaluation.per_shape import ShapeMetrics, stack_seeds
 from train.experiments.paper import deterministic, highly_diverse
 from train.experiments.table import claim_lines, judged, mean_and_spread, table_lines, trainings
 from train.experiments.workbench import Change, Workbench, as_it_is
@@ -103,7 +103,7 @@ def coverage(bench: Workbench) -> dict[str, Any]:
             objects.extend(make_object(hider, size) for hider in bar)
         return objects
 
-    rows: dict[str, list[Scores]] = {}
+    rows: dict[str, list[ShapeMetrics]] = {}
     for seed in range(bench.seeds):
         for name, (change, codes) in _NETWORKS.items():
             found = _kept(bench, bench.config(change, seed=seed), hiders, needed, codes=codes, seed=seed)
@@ -125,13 +125,13 @@ def coverage(bench: Workbench) -> dict[str, Any]:
             }
             for category in dict.fromkeys(h.category for h in hiders)
         },
-        "claims": _claims({name: stacked(found) for name, found in rows.items()}),
+        "claims": _claims({name: stack_seeds(found) for name, found in rows.items()}),
     }
     bench.publish("coverage", result, _markdown(result), _figure(bench, hiders, size, result))
     return result
 
 
-def _claims(rows: Mapping[str, Scores]) -> list[dict[str, Any]]:
+def _claims(rows: Mapping[str, ShapeMetrics]) -> list[dict[str, Any]]:
     """What codes are for: other backs, and none that there is not."""
     coded = [f"{name}, {CODES[0]} codes" for name in ("ours", "highly diverse")]
     reached = [
@@ -238,7 +238,7 @@ def _collect(found: Sequence[dict[int, dict[str, float]]]) -> dict[str, Tensor]:
     }
 
 
-def _split_up(scores: Scores, counts: Sequence[int]) -> dict[int, Scores]:
+def _split_up(scores: ShapeMetrics, counts: Sequence[int]) -> dict[int, ShapeMetrics]:
     return {
         count: {name.split("/")[1]: v for name, v in scores.items() if name.split("/")[0] == str(count)}
         for count in counts
@@ -247,8 +247,8 @@ def _split_up(scores: Scores, counts: Sequence[int]) -> dict[int, Scores]:
 
 def _kept(
     bench: Workbench, config: Any, hiders: list[Hider], needed: Any, *, codes: Sequence[int], seed: int
-) -> dict[int, Scores]:
-    def take() -> Scores:
+) -> dict[int, ShapeMetrics]:
+    def take() -> ShapeMetrics:
         model = bench.network(config)
         bar = tqdm(needed(), desc="answers", unit="object", disable=not bench.progress)
         return _collect([_judge(obj, answers(model, obj.image, max(codes), seed=seed), codes) for obj in bar])
@@ -264,11 +264,11 @@ def answers(model: Predictor, image: Tensor, count: int, *, seed: int) -> Tensor
     return model(image[None], codes)[:, 0].contiguous()
 
 
-def _without_network(bench: Workbench, hiders: list[Hider], needed: Any) -> dict[str, Scores]:
+def _without_network(bench: Workbench, hiders: list[Hider], needed: Any) -> dict[str, ShapeMetrics]:
     """Random training shapes of the category, and samples of the backs themselves, as large as one prediction."""
     config = bench.config(as_it_is, seed=0)
 
-    def take() -> Scores:
+    def take() -> ShapeMetrics:
         points = bench.network(config).points
         train = bench.split(config, "train")
         random = np.random.default_rng(0)
@@ -289,7 +289,7 @@ def _without_network(bench: Workbench, hiders: list[Hider], needed: Any) -> dict
     }
 
 
-def _summary(by_seed: Sequence[Scores]) -> dict[str, Any]:
+def _summary(by_seed: Sequence[ShapeMetrics]) -> dict[str, Any]:
     means = {name: torch.stack([s[name].mean() for s in by_seed]) for name in by_seed[0]}
     return {
         name: {"mean": v.mean().item(), "sd": v.std().item() if len(v) > 1 else None, "by_seed": v.tolist()}

@@ -10,7 +10,7 @@ import torch
 from matplotlib.figure import Figure
 
 from train.config import FitConfig
-from train.evaluation.per_shape import Scores
+from train.evaluation.per_shape import ShapeMetrics
 from train.evaluation.runs import read_metrics
 from train.experiments.paper import CRITIC, with_critic
 from train.experiments.table import figure, markdown, tabulate, trainings
@@ -37,10 +37,10 @@ def critic(bench: Workbench) -> dict[str, Any]:
     return result
 
 
-def _opinion(bench: Workbench, config: FitConfig) -> Scores:
+def _opinion(bench: Workbench, config: FitConfig) -> ShapeMetrics:
     """A critic at every logged step, (K,): "step", "stage", its mean scores of predictions and of real shapes."""
 
-    def take() -> Scores:
+    def take() -> ShapeMetrics:
         records = [record for record in read_metrics(bench.train(config)) if "fake_score" in record]
         names = ("step", "stage", "fake_score", "real_score")
         return {name: torch.tensor([record[name] for record in records]).double() for name in names}
@@ -48,14 +48,14 @@ def _opinion(bench: Workbench, config: FitConfig) -> Scores:
     return bench.kept(["the critic's opinion", bench.run_of(config).name], take)
 
 
-def _in_parts(opinion: Scores) -> dict[str, list[float]]:
+def _in_parts(opinion: ShapeMetrics) -> dict[str, list[float]]:
     return {
         name: [part.mean().item() for part in opinion[f"{name}_score"].tensor_split(_PARTS) if len(part)]
         for name in ("fake", "real")
     }
 
 
-def _scores_figure(opinions: Sequence[Scores]) -> Figure:
+def _scores_figure(opinions: Sequence[ShapeMetrics]) -> Figure:
     """Left: scores of predictions and of real shapes; right: how far predictions are behind. A line a training."""
     drawn = Figure(figsize=(12, 4.4), layout="constrained", dpi=110)
     left, right = drawn.subplots(1, 2)

@@ -10,7 +10,7 @@ import torch
 from models import Predictor
 from train.config import FitConfig, System, with_variant
 from train.data.batches import LoadedSplit
-from train.evaluation.per_shape import SHAPES_AT_ONCE, Scores, compare, joined
+from train.evaluation.per_shape import SHAPES_AT_ONCE, ShapeMetrics, compare_clouds, concatenate
 from train.experiments.table import Claim, Row, Table, below
 from train.experiments.ten_answers import ten_answers
 from train.experiments.workbench import Change, Workbench, as_it_is
@@ -114,17 +114,17 @@ _PTN = {"gt_to_pred": 1.86, "pred_to_gt": 2.60, "cd": 4.46}
 _R2N2 = {"gt_to_pred": 2.47, "pred_to_gt": 3.21, "cd": 5.68}
 
 
-def _perfectly_taught(row: Row, bench: Workbench, config: FitConfig) -> Scores:
+def _perfectly_taught(row: Row, bench: Workbench, config: FitConfig) -> ShapeMetrics:
     """What a method's kind of answer can be at best: its grid, its maps or its number of points, without an error."""
     ideal = METHODS[config.system].ideal
     assert ideal is not None
 
-    def measure(network: Predictor, test: LoadedSplit) -> Scores:
+    def measure(network: Predictor, test: LoadedSplit) -> ShapeMetrics:
         parts = []
         for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
             clouds = ideal(network, test.truth(shapes))
-            parts.append(compare(clouds, test.points[shapes], points=network.points))
-        return joined(parts)
+            parts.append(compare_clouds(clouds, test.points[shapes], points=network.points))
+        return concatenate(parts)
 
     return bench.measured(config, ["perfectly taught"], measure, stage=0)
 

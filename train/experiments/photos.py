@@ -23,7 +23,7 @@ from train.data.photos import Photo, find_photos
 from train.data.render import orbit_camera
 from train.errors import UserError
 from train.evaluation.inference import reconstruct
-from train.evaluation.per_shape import Scores
+from train.evaluation.per_shape import ShapeMetrics
 from train.evaluation.reconstruct import MOST_IMAGES, read_pictures
 from train.experiments.table import table_lines, trainings
 from train.experiments.workbench import Workbench, as_it_is
@@ -126,7 +126,7 @@ def _read(photo: Photo) -> Tensor:
     return torch.from_numpy(made.picture).permute(2, 0, 1)[None] / 255
 
 
-def _answers(bench: Workbench, config: FitConfig, found: _Object) -> Scores:
+def _answers(bench: Workbench, config: FitConfig, found: _Object) -> ShapeMetrics:
     """What a training makes of an object.
 
     Returns:
@@ -134,7 +134,7 @@ def _answers(bench: Workbench, config: FitConfig, found: _Object) -> Scores:
         consistency loss x100 after each of `_STEPS`, NaN for a single picture.
     """
 
-    def take() -> Scores:
+    def take() -> ShapeMetrics:
         model = bench.network(config)
         codes = torch.randn(CODES, 1, model.code_dim, generator=torch.Generator().manual_seed(config.seed))
         with torch.no_grad():
@@ -154,7 +154,7 @@ def _answers(bench: Workbench, config: FitConfig, found: _Object) -> Scores:
     return bench.kept(["photos", bench.run_of(config).name, settings, config.seed, CODES, digest], take)
 
 
-def _losses(by_seed: Sequence[Scores]) -> dict[str, Any]:
+def _losses(by_seed: Sequence[ShapeMetrics]) -> dict[str, Any]:
     values = torch.stack([each["losses"] for each in by_seed])
     if values.isnan().any():
         return dict.fromkeys(_STEPS)
@@ -181,7 +181,7 @@ def _markdown(result: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _figure(result: Mapping[str, Any], objects: Sequence[_Object], answers: Sequence[Scores]) -> Figure:
+def _figure(result: Mapping[str, Any], objects: Sequence[_Object], answers: Sequence[ShapeMetrics]) -> Figure:
     """A row for each object. Nothing says where its cameras stood: clouds are seen from the network's own front."""
     most = max(len(found.pictures) for found in objects)
     shown = min(most, _SHOWN_PICTURES)

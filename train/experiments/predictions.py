@@ -14,7 +14,7 @@ from models import Generator
 from train.data import ShapeTree
 from train.data.batches import LoadedSplit
 from train.errors import UserError
-from train.evaluation.per_shape import Scores, answers, joined, stacked
+from train.evaluation.per_shape import ShapeMetrics, concatenate, sample_predictions, stack_seeds
 from train.evaluation.report import make_example, pick_shapes
 from train.experiments.table import judged, table_lines, trainings
 from train.experiments.workbench import Workbench, as_it_is
@@ -43,7 +43,7 @@ def predictions(bench: Workbench) -> dict[str, Any]:
         key = ["spread", bench.run_of(config).name, CODES, test.fingerprint]
         model = _generator(bench, config)
         by_seed.append(bench.kept(key, lambda model=model, seed=config.seed: _spreads(model, test, seed)))
-    scores = stacked(by_seed)
+    scores = stack_seeds(by_seed)
     names = list(dict.fromkeys(test.categories))
     result = bench.about(configs[0]) | {
         "shapes": len(test),
@@ -94,9 +94,9 @@ def spread(clouds: Tensor, camera: PinholeCamera) -> dict[str, Tensor]:
     return found | {"front_share": front.to(mean.dtype).mean(-1)}
 
 
-def _spreads(model: Generator, test: LoadedSplit, seed: int) -> Scores:
-    answered = answers(model, test, codes=CODES, seed=seed)
-    found = joined([spread(clouds, shown.camera) for _, shown, clouds in answered])
+def _spreads(model: Generator, test: LoadedSplit, seed: int) -> ShapeMetrics:
+    answered = sample_predictions(model, test, codes=CODES, seed=seed)
+    found = concatenate([spread(clouds, shown.camera) for _, shown, clouds in answered])
     return {name: values.double() for name, values in found.items()}
 
 

@@ -15,7 +15,7 @@ from train.data.batches import LoadedSplit
 from train.data.tree import read_shape
 from train.evaluation.inference import reconstruct
 from train.evaluation.metrics import cloud_errors, thin_out
-from train.evaluation.per_shape import Scores, view_order
+from train.evaluation.per_shape import ShapeMetrics, view_order
 from train.experiments.paper import of_system
 from train.experiments.table import table_lines
 from train.experiments.workbench import Change, Workbench, as_it_is
@@ -98,11 +98,11 @@ def picked(categories: Sequence[str], count: int) -> Tensor:
     return torch.tensor(sorted(range(len(categories)), key=ranks.__getitem__)[:count])
 
 
-def _answers(bench: Workbench, config: FitConfig, chosen: Tensor, views: Tensor) -> Scores:
+def _answers(bench: Workbench, config: FitConfig, chosen: Tensor, views: Tensor) -> ShapeMetrics:
     """What a method makes of `views` (M, V) of shapes (M,): "points" (M, N, 3), "cd" and "fps_cd" (M,)."""
     test: LoadedSplit = bench.split(config, "test")  # at the size at which this network looks at images
 
-    def take() -> Scores:
+    def take() -> ShapeMetrics:
         model = bench.network(config)
         images, truth = test.float_images(chosen, views), test.points[chosen]
         found = reconstruct(model, images, seed=SEED, settings=config.inference).points

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from train.config import FitConfig, InferenceConfig, scaled
-from train.evaluation.per_shape import Scores, stacked
+from train.evaluation.per_shape import ShapeMetrics, stack_seeds
 from train.experiments.workbench import Change, Workbench, as_it_is, stage1_of
 from train.show import figures
 
@@ -44,11 +44,11 @@ _CPU_STEPS_FOR_ONE_CATEGORY = 0.5
 _RESAMPLES = 4000
 _SURE = 0.9
 
-Measure = Callable[["Row", Workbench, FitConfig], Scores]
+Measure = Callable[["Row", Workbench, FitConfig], ShapeMetrics]
 """(row, bench, its configuration with a seed) -> figure -> (M,) of every held-out shape."""
 
 
-def reconstructions(row: Row, bench: Workbench, config: FitConfig) -> Scores:
+def reconstructions(row: Row, bench: Workbench, config: FitConfig) -> ShapeMetrics:
     """What a row's system makes of several images of each shape, beside the truth."""
     if row.answer in ("medoid", "nearest image"):
         return bench.trivial_scores(row.answer, config, views=row.views)
@@ -213,7 +213,7 @@ def tabulate(table: Table, bench: Workbench) -> dict[str, Any]:
     }
     bench.measure_all(measured, [(row, config) for row in table.rows for config in configs[row.name]])
     scores = {
-        row.name: stacked([measured(bench, row, config) for config in configs[row.name]])
+        row.name: stack_seeds([measured(bench, row, config) for config in configs[row.name]])
         for row in table.rows
     }
     config = table.config(table.rows[0], bench, seed=0)
@@ -236,12 +236,12 @@ def tabulate(table: Table, bench: Workbench) -> dict[str, Any]:
     return result
 
 
-def measured(bench: Workbench, row: Row, config: FitConfig) -> Scores:
+def measured(bench: Workbench, row: Row, config: FitConfig) -> ShapeMetrics:
     """A row's figures for one training, taken now or kept."""
     return row.measure(row, bench, config)
 
 
-def _figures(row: Row, scores: Scores, columns: Sequence[str]) -> dict[str, Any]:
+def _figures(row: Row, scores: ShapeMetrics, columns: Sequence[str]) -> dict[str, Any]:
     """A row's mean and standard deviation over trainings, and what the descent did to the consistency loss."""
     by_seed = {name: scores[name].mean(1) for name in columns if name in scores}
     found: dict[str, Any] = {
@@ -260,7 +260,7 @@ def _figures(row: Row, scores: Scores, columns: Sequence[str]) -> dict[str, Any]
     return found
 
 
-def _categories(table: Table, scores: Mapping[str, Scores], kinds: Sequence[str]) -> dict[str, Any]:
+def _categories(table: Table, scores: Mapping[str, ShapeMetrics], kinds: Sequence[str]) -> dict[str, Any]:
     """Each category's figures and verdicts, and the averages of shapes and of categories."""
     found: dict[str, Any] = {}
     for kind in dict.fromkeys(kinds):
@@ -276,7 +276,7 @@ def _categories(table: Table, scores: Mapping[str, Scores], kinds: Sequence[str]
     return found
 
 
-def _verdict(claim: Claim, rows: Mapping[str, Scores], paper: Rows) -> dict[str, Any]:
+def _verdict(claim: Claim, rows: Mapping[str, ShapeMetrics], paper: Rows) -> dict[str, Any]:
     try:
         theirs = claim.gain(paper)
     except KeyError:  # the paper has no figure for one of the rows

@@ -13,12 +13,12 @@ from train.config import FitConfig, StageConfig
 from train.data.batches import Batch, LoadedSplit
 from train.evaluation.metrics import visible_error
 from train.evaluation.per_shape import (
-    Scores,
-    answers,
-    distance_between,
+    ShapeMetrics,
+    concatenate,
     distance_to_nearest,
-    joined,
     one_view_each,
+    pairwise_distance,
+    sample_predictions,
 )
 from train.evaluation.runs import load_autoencoder
 from train.experiments.table import Row
@@ -37,16 +37,16 @@ Source = Callable[[LoadedSplit, int], Iterator[tuple[Tensor, Batch, Tensor]]]
 as many as there are."""
 
 
-def ten_answers(row: Row, bench: Workbench, config: FitConfig) -> Scores:
+def ten_answers(row: Row, bench: Workbench, config: FitConfig) -> ShapeMetrics:
     """A row's figures, as chamfer distances x100: "diversity" between the answers to one image, "visible" from what it
     shows, "novelty" of one of them from the nearest training shape. All but the first tell other shapes from noise, and
     so does "critic" for rows with a judge, see `below_real_shapes`."""
     points, train = cloud_size(config), bench.split(config, "train")
     some = torch.linspace(0, len(train) - 1, min(_NEAREST_AMONG, len(train))).long()
 
-    def spread(given: Source, test: LoadedSplit) -> Scores:
+    def spread(given: Source, test: LoadedSplit) -> ShapeMetrics:
         real = train.points[some, :points]
-        return joined([_spread(shown, clouds, real=real) for _, shown, clouds in given(test, _ANSWERS)])
+        return concatenate([_spread(shown, clouds, real=real) for _, shown, clouds in given(test, _ANSWERS)])
 
     found = _taken(row, bench, config, "spread", [train.fingerprint, len(some)], spread)
     if row.judge is None:
@@ -54,7 +54,7 @@ def ten_answers(row: Row, bench: Workbench, config: FitConfig) -> Scores:
     judge, steps = bench.config(row.judge, seed=config.seed), bench.steps or _STEPS
     taught = bench.split(config, "train", limit=_TAUGHT_ON)
 
-    def critic(given: Source, test: LoadedSplit) -> Scores:
+    def critic(given: Source, test: LoadedSplit) -> ShapeMetrics:
         encode = load_autoencoder(bench.train(judge)).encode_frozen
         return below_real_shapes(
             given, test, taught=taught, encode=encode, points=points, seed=config.seed, steps=steps
@@ -70,8 +70,8 @@ def _taken(
     config: FitConfig,
     name: str,
     beside: list,
-    measure: Callable[[Source, LoadedSplit], Scores],
-) -> Scores:
+    measure: Callable[[Source, LoadedSplit], ShapeMetrics],
+) -> ShapeMetrics:
     """A measurement of what a row's network answers; or of true shapes in place of answers: what it says of samples of
     one surface, and of shapes that are real."""
     if row.answer == "truth":
@@ -80,8 +80,10 @@ def _taken(
         key = [f"{name} of samples", config.seed, points, test.fingerprint, *beside]
         return bench.kept(key, lambda: measure(source, test))
 
-    def of_network(model: Predictor, test: LoadedSplit) -> Scores:
-        return measure(lambda split, count: answers(model, split, codes=count, seed=config.seed), test)
+    def of_network(model: Predictor, test: LoadedSplit) -> ShapeMetrics:
+        return measure(
+            lambda split, count: sample_predictions(model, split, codes=count, seed=config.seed), test
+        )
 
     return bench.measured(config, [f"{name} of answers", _ANSWERS, *beside], of_network, stage=row.stage)
 
@@ -98,10 +100,10 @@ def _samples(
         yield shapes, shown, torch.stack([split.points[shapes][:, sample] for sample in samples])
 
 
-def _spread(shown: Batch, clouds: Tensor, *, real: Tensor) -> Scores:
+def _spread(shown: Batch, clouds: Tensor, *, real: Tensor) -> ShapeMetrics:
     visible = [visible_error(cloud, shown.camera, shown.depth)[:, 0] for cloud in clouds]
     figures = {
-        "diversity": distance_between(clouds),
+        "diversity": pairwise_distance(clouds),
         "visible": torch.stack(visible).mean(0),
         "novelty": distance_to_nearest(clouds[0], real),
     }
@@ -117,7 +119,7 @@ def below_real_shapes(
     points: int,
     seed: int,
     steps: int,
-) -> Scores:
+) -> ShapeMetrics:
     """How far a critic puts answers below real shapes, after it has learnt to tell just these from real ones.
 
     It is trained afresh for every source, on its answers to training images: the critic of a training knows the

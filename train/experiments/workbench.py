@@ -25,7 +25,13 @@ from models import Predictor
 from train.config import PROFILES, FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
 from train.data.batches import LoadedSplit
 from train.errors import UserError
-from train.evaluation.per_shape import SHAPES_AT_ONCE, Scores, compare, joined, score
+from train.evaluation.per_shape import (
+    SHAPES_AT_ONCE,
+    ShapeMetrics,
+    compare_clouds,
+    concatenate,
+    evaluate_split,
+)
 from train.evaluation.retrieval import medoid, nearest_by_image
 from train.evaluation.runs import best_weights, load_predictor, read_split
 from train.experiments.side_by_side import run_side_by_side
@@ -251,7 +257,7 @@ class Workbench:
         views: int,
         split: Literal["train", "val", "test"] = "test",
         code_seed: int | None = None,
-    ) -> Scores:
+    ) -> ShapeMetrics:
         """Figure -> (M,) of a configuration's network, trained if need be. Codes and views are drawn by its seed.
 
         Args:
@@ -263,8 +269,8 @@ class Workbench:
             code_seed: draws the codes in place of the configuration's seed.
         """
 
-        def measure(model: Predictor, data: LoadedSplit) -> Scores:
-            return score(model, data, settings, views=views, seed=config.seed, code_seed=code_seed)
+        def measure(model: Predictor, data: LoadedSplit) -> ShapeMetrics:
+            return evaluate_split(model, data, settings, views=views, seed=config.seed, code_seed=code_seed)
 
         what = [dataclasses.asdict(settings), views, *([] if code_seed is None else [code_seed])]
         return self.measured(config, what, measure, stage=stage, split=split)
@@ -273,11 +279,11 @@ class Workbench:
         self,
         config: FitConfig,
         what: object,
-        measure: Callable[[Predictor, LoadedSplit], Scores],
+        measure: Callable[[Predictor, LoadedSplit], ShapeMetrics],
         *,
         stage: Literal[0, 1, 2] = 2,
         split: Literal["train", "val", "test"] = "test",
-    ) -> Scores:
+    ) -> ShapeMetrics:
         """What a function finds of a configuration's network on a split, trained and measured if need be.
 
         Args:
@@ -290,7 +296,7 @@ class Workbench:
         data = self.split(config, split, limit=_SOME_TRAINING_SHAPES if split == "train" else None)
         run = self.run_of(stage1_of(config) if stage == 1 else config)
 
-        def take() -> Scores:
+        def take() -> ShapeMetrics:
             found = measure(self.network(config, stage=stage), data)
             return {name: values.double() for name, values in found.items()}
 
@@ -310,18 +316,20 @@ class Workbench:
 
     def trivial_scores(
         self, answer: Literal["medoid", "nearest image"], config: FitConfig, *, views: int
-    ) -> Scores:
+    ) -> ShapeMetrics:
         """Figure -> (M,) of an answer that needs no network, for the data that a configuration sees."""
         test, train = self.split(config, "test"), self.split(config, "train")
         points = cloud_size(config)
 
-        def take() -> Scores:
+        def take() -> ShapeMetrics:
             if answer == "medoid":
                 clouds = train.points[medoid(train.points)].expand_as(test.points)
             else:
                 clouds = train.points[nearest_by_image(test, train, views=(views,))[views]]
             parts = zip(clouds.split(SHAPES_AT_ONCE), test.points.split(SHAPES_AT_ONCE), strict=True)
-            found = joined([compare(cloud.contiguous(), truth, points=points) for cloud, truth in parts])
+            found = concatenate(
+                [compare_clouds(cloud.contiguous(), truth, points=points) for cloud, truth in parts]
+            )
             return {name: values.double() for name, values in found.items()}
 
         key = [answer, points, image_size(config), views, train.fingerprint, test.fingerprint]
@@ -341,7 +349,7 @@ class Workbench:
             )
         return self._loaded[key]
 
-    def kept(self, key: Sequence[object], take: Callable[[], Scores]) -> Scores:
+    def kept(self, key: Sequence[object], take: Callable[[], ShapeMetrics]) -> ShapeMetrics:
         """What was measured under a key of plain JSON values: taken now, and kept, or there already.
 
         Args:

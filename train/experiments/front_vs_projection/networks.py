@@ -15,7 +15,7 @@ from models import Predictor
 from train.config import FitConfig, InferenceConfig, StageConfig, Supervision, fit_config_from_json
 from train.data.batches import Batch, LoadedSplit
 from train.evaluation.metrics import cloud_errors, in_silhouette, visible_error
-from train.evaluation.per_shape import Scores, answers, joined, one_view_each
+from train.evaluation.per_shape import ShapeMetrics, concatenate, one_view_each, sample_predictions
 from train.evaluation.runs import read_metrics
 from train.experiments.workbench import Workbench
 from train.methods.systems import size_of
@@ -105,7 +105,7 @@ def configs(bench: Workbench) -> list[FitConfig]:
     ]
 
 
-def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> Scores:
+def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> ShapeMetrics:
     """Figure -> (M,) of each shape's prediction from its first view in a seed's order, with one random code.
 
     "cd_1", "pred_to_gt", "gt_to_pred" x100 against the whole shape; "visible" and "inside" as in validation;
@@ -113,11 +113,13 @@ def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> Scores:
     that it sees (1: as dense as behind); "imbalance": which share of the points would have to move to another of 32
     parts of the surface for all parts to be as dense (0 to 1).
     """
-    answered = answers(model, test, codes=1, seed=seed)
-    return joined([beside_the_truth(made[0], test.points[shapes], shown) for shapes, shown, made in answered])
+    answered = sample_predictions(model, test, codes=1, seed=seed)
+    return concatenate(
+        [beside_the_truth(made[0], test.points[shapes], shown) for shapes, shown, made in answered]
+    )
 
 
-def beside_the_truth(clouds: Tensor, truth: Tensor, shown: Batch) -> Scores:
+def beside_the_truth(clouds: Tensor, truth: Tensor, shown: Batch) -> ShapeMetrics:
     """The figures of `single_views` of clouds (B, N, 3) beside true ones (B, P, 3), of which one view each is shown."""
     errors = cloud_errors(clouds, truth)
     return {
@@ -130,7 +132,7 @@ def beside_the_truth(clouds: Tensor, truth: Tensor, shown: Batch) -> Scores:
     }
 
 
-def densities(clouds: Tensor, truth: Tensor, seen: Tensor) -> Scores:
+def densities(clouds: Tensor, truth: Tensor, seen: Tensor) -> ShapeMetrics:
     """How evenly clouds (B, N, 3) lie on surfaces; see `single_views`.
 
     Args:
@@ -228,7 +230,7 @@ def _floor(bench: Workbench) -> dict[str, float]:
         beside_the_truth(test.clouds(shapes, some[shapes]), test.points[shapes], shown)
         for shapes, shown in one_view_each(test, 0)
     ]
-    return {name: values.mean().item() for name, values in joined(found).items()}
+    return {name: values.mean().item() for name, values in concatenate(found).items()}
 
 
 def _single(bench: Workbench, taught: Taught) -> dict[str, Any]:

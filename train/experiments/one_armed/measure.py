@@ -23,7 +23,7 @@ from train.data.rules import hider_of
 from train.errors import UserError
 from train.evaluation.inference import reconstruct
 from train.evaluation.metrics import cloud_errors
-from train.evaluation.per_shape import Scores, stacked
+from train.evaluation.per_shape import ShapeMetrics, stack_seeds
 from train.experiments.one_armed.chairs import RULES, SEED, Arms, OneArmedChair, one_armed_chairs
 from train.experiments.one_armed.page import CODED, COLUMNS, DRAWN, PLAIN, PSGN, ROWS, TWO, figure, page
 from train.experiments.paper import deterministic, of_system
@@ -77,13 +77,13 @@ def one_armed(bench: Workbench) -> dict[str, Any]:
     known = bench.kept(which, lambda: _record(needed()))
     clouds: list[dict[str, dict[Arms, Tensor]]] = []
     for seed in range(bench.seeds):
-        made: dict[str, Scores] = {}
+        made: dict[str, ShapeMetrics] = {}
         for name, change in _CHANGES.items():
             config = bench.config(change, seed=seed)
             key = [*which, bench.run_of(config).name, dataclasses.asdict(config.inference), size, CODES]
             made[name] = bench.kept(key, lambda config=config: _answers(bench, config, needed(), size))
         clouds.append(_rows(made, known))
-    drawn = stacked([_drawn(rows, known) for rows in clouds])
+    drawn = stack_seeds([_drawn(rows, known) for rows in clouds])
     result = bench.about(bench.config(as_it_is, seed=0)) | _summary(drawn, known)
     shown = {name: variants["one"][:_SHOWN, 0] for name, variants in clouds[0].items()}
     bench.publish("one-armed", result, page(result), figure(result, size, known, shown, drawn))
@@ -122,7 +122,7 @@ def _check(bench: Workbench) -> None:
         )
 
 
-def _record(chairs: list[OneArmedChair]) -> Scores:
+def _record(chairs: list[OneArmedChair]) -> ShapeMetrics:
     """What is kept of the chairs, each (M, ...), and samples (M, P, 3) of them by their arms."""
     fields = ("boxes", "shares", "changed")
     found = {name: torch.from_numpy(np.stack([getattr(c, name) for c in chairs])).double() for name in fields}
@@ -134,7 +134,7 @@ def _record(chairs: list[OneArmedChair]) -> Scores:
     return found
 
 
-def _answers(bench: Workbench, config: FitConfig, chairs: list[OneArmedChair], size: int) -> Scores:
+def _answers(bench: Workbench, config: FitConfig, chairs: list[OneArmedChair], size: int) -> ShapeMetrics:
     """What a network makes of each chair by its arms: "ARMS" (M, 2, N, 3) of views A and B, by ours after they agreed.
 
     Of ours also "ARMS, codes" (M, K, N, 3), from view A with random codes, the same for all three.
@@ -142,7 +142,7 @@ def _answers(bench: Workbench, config: FitConfig, chairs: list[OneArmedChair], s
     model = bench.network(config)
     generator = torch.Generator().manual_seed(config.seed)
     codes = torch.randn(CODES, len(chairs), model.code_dim, generator=generator)
-    found: Scores = {}
+    found: ShapeMetrics = {}
     for arms in get_args(Arms):
         pictures = torch.from_numpy(np.stack([chair.images(size, arms) for chair in chairs]))
         images = pictures.permute(0, 1, 4, 2, 3).float() / 255
@@ -154,7 +154,7 @@ def _answers(bench: Workbench, config: FitConfig, chairs: list[OneArmedChair], s
     return found
 
 
-def _rows(made: Mapping[str, Scores], known: Scores) -> dict[str, dict[Arms, Tensor]]:
+def _rows(made: Mapping[str, ShapeMetrics], known: ShapeMetrics) -> dict[str, dict[Arms, Tensor]]:
     """Row -> the clouds (M, K, N, 3) that it is about, by the chairs' arms."""
     rows: dict[str, dict[Arms, Tensor]] = {name: {} for name in ROWS}
     for arms in get_args(Arms):
@@ -170,7 +170,7 @@ def _rows(made: Mapping[str, Scores], known: Scores) -> dict[str, dict[Arms, Ten
     return rows
 
 
-def _drawn(rows: Mapping[str, Mapping[Arms, Tensor]], known: Scores) -> Scores:
+def _drawn(rows: Mapping[str, Mapping[Arms, Tensor]], known: ShapeMetrics) -> ShapeMetrics:
     """Row -> (M, K, 4): `presence` of the figures of `COLUMNS`."""
     boxes, shares = known["boxes"], known["shares"]
     found = {}
@@ -180,7 +180,7 @@ def _drawn(rows: Mapping[str, Mapping[Arms, Tensor]], known: Scores) -> Scores:
     return found
 
 
-def _summary(drawn: Scores, known: Scores) -> dict[str, Any]:
+def _summary(drawn: ShapeMetrics, known: ShapeMetrics) -> dict[str, Any]:
     """From (S, M, K, 4) of every row, see `_drawn`."""
     means = {
         name: dict(zip(COLUMNS, values.mean(2).unbind(-1), strict=True)) for name, values in drawn.items()

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, project
 from train.data.render import orbit_camera
-from train.evaluation.per_shape import Scores
+from train.evaluation.per_shape import ShapeMetrics
 from train.experiments.one_armed.chairs import SEED, make_chair
 from train.experiments.table import claim_lines, mean_and_spread, table_lines, trainings
 from train.show import figures
@@ -79,7 +79,11 @@ def _caution(rows: Mapping[str, Any]) -> str:
 
 
 def figure(
-    result: Mapping[str, Any], size: int, known: Scores, clouds: Mapping[str, Tensor], drawn: Scores
+    result: Mapping[str, Any],
+    size: int,
+    known: ShapeMetrics,
+    clouds: Mapping[str, Tensor],
+    drawn: ShapeMetrics,
 ) -> Figure:
     """The first chairs with what the first training makes of them, seen from above the missing arm.
 
