@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib
-import importlib.util
+import inspect
 import io
 import os
 import platform
@@ -13,9 +13,10 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
+from diffpoint._backend import BACKENDS, backend_name, import_backend
 from diffpoint._launch import FastCall
 
 # Taichi runs a parallel loop of up to 512 iterations on one thread unless it was started with other settings.
@@ -51,15 +52,9 @@ class _Runtime:
         self.kernels: dict[tuple[str, str], SimpleNamespace] = {}
         self.calls: dict[tuple[str, str, str], FastCall] = {}
 
-    def backend(self) -> ModuleType:
-        name = os.environ.get("DIFFPOINT_BACKEND", "")
-        if name not in ("", "taichi", "quadrants"):
-            raise RuntimeError(f"diffpoint: DIFFPOINT_BACKEND must be 'taichi' or 'quadrants'; got {name!r}.")
-        return _quiet_import(name or _installed_backend())
-
     def current_program(self) -> Any:
         """The running Taichi program, whoever started it; None before any."""
-        backend = sys.modules.get("taichi") or sys.modules.get("quadrants")
+        backend = sys.modules.get(backend_name())
         if backend is None:
             return None
         runtime = backend.lang.impl.get_runtime()
@@ -81,7 +76,7 @@ class _Runtime:
         return 1 if program is self.program else _HOST_SPREAD
 
     def _start(self) -> Any:
-        ti = self.backend()
+        ti = import_backend()
         with contextlib.redirect_stdout(io.StringIO()):  # init announces itself on stdout
             ti.init(
                 arch=ti.cpu,
@@ -100,7 +95,7 @@ class _Runtime:
         """The kernels of `diffpoint.kernels.<module>` for "f32" or "f64"."""
         key = (module, real)
         if key not in self.kernels:
-            ti = self.backend()
+            ti = import_backend()
             self.kernels[key] = importlib.import_module(f"diffpoint.kernels.{module}").build(
                 getattr(ti, real)
             )
@@ -113,22 +108,9 @@ class _Runtime:
             self.calls[key] = FastCall(getattr(self.kernel(module, real), kernel))
         return self.calls[key]
 
-
-def _installed_backend() -> str:
-    for name in ("taichi", "quadrants"):
-        if name in sys.modules or importlib.util.find_spec(name) is not None:
-            return name
-    raise ImportError(
-        "diffpoint: neither taichi nor quadrants is installed. Install one: pip install taichi."
-    )
-
-
-def _quiet_import(name: str) -> ModuleType:
-    if name not in sys.modules:
-        for backend in ("TAICHI", "QUADRANTS"):
-            os.environ.setdefault(f"ENABLE_{backend}_HEADER_PRINT", "0")
-        os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # it would start a thread and use the network
-    return importlib.import_module(name)
+    def argument_name(self, module: str, kernel: str, position: int) -> str:
+        """What the kernel's source calls its argument."""
+        return list(inspect.signature(getattr(self.kernel(module, "f32"), kernel)).parameters)[position]
 
 
 def available_threads() -> int:
@@ -142,7 +124,7 @@ RUNTIME = _Runtime()
 
 
 def _mark_forked() -> None:
-    if RUNTIME.current_program() is not None:
+    if any(name in sys.modules for name in BACKENDS) and RUNTIME.current_program() is not None:
         RUNTIME.forked = True
     RUNTIME.lock = threading.RLock()  # another thread of the parent may have held it
 
@@ -187,7 +169,7 @@ def runtime_info() -> RuntimeInfo:
         True
     """
     with RUNTIME.lock:
-        ti = RUNTIME.backend()
+        ti = import_backend()
         program = RUNTIME.current_program()
         if program is None:
             owner, threads = "nobody", RUNTIME.threads or available_threads()

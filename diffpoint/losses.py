@@ -23,6 +23,7 @@ from diffpoint.views import sample_view
 from diffpoint.visibility import Method, visible_points
 
 Reduction = Literal["mean", "none"]
+Distance = Literal["chamfer", "emd"]
 
 
 class FrontSets(NamedTuple):
@@ -37,7 +38,7 @@ class FrontSets(NamedTuple):
     observed_lengths: Tensor
     """(B, V) int64; 0 for an empty depth map."""
     fallback: Tensor
-    """(B, V) bool: no predicted point was visible, so the whole cloud stands in and is pulled into view."""
+    """(B, V) bool: no predicted point was visible, so `predicted` is the whole cloud."""
 
 
 def front_sets(
@@ -78,12 +79,101 @@ def front_sets(
     return FrontSets(seen, lengths, observed[:, :, :longest], observed_lengths, fallback)
 
 
+class FrontTerms(NamedTuple):
+    """The front constraint of each view, and how many points it compared."""
+
+    loss: Tensor
+    """(B, V) world units; 0, with gradient 0, where the depth map is empty."""
+    matched: Tensor
+    """(B, V) int64: size of the smaller of the two sets, which is the number of pairs of an assignment between them."""
+    observed: Tensor
+    """(B, V) int64: number of points of the depth map."""
+    fallback: Tensor
+    """(B, V) bool: no predicted point was visible though the depth map is not empty; the whole cloud was compared."""
+
+
+def front_terms(
+    points: Tensor,
+    camera: PinholeCamera,
+    depth: Tensor,
+    *,
+    distance: Distance = "chamfer",
+    tolerance: float = 0.02,
+    visibility: Method = "zbuffer",
+) -> FrontTerms:
+    """The front constraint of each view, before reduction and without warnings; see `front_constraint`.
+
+    Args:
+        points: (B, N, 3) predicted clouds in the world.
+        camera: batch shape (), (V,) or (B, V), of the depth maps' size.
+        depth: (B, V, H, W) true depth maps, +inf where empty.
+        distance: "chamfer": sum of both directions' mean distances; "emd": mean distance of the assignment. The sum
+            over matched points, as in the paper, is `loss * matched`.
+        tolerance: of the earth mover's distance.
+        visibility: how the predicted points that a view sees are found; a method of `visible_points`.
+
+    Gradients: of `loss` to x, y and z of the visible points, and to `depth` and the camera; none through the choice
+        of the points.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, an unknown distance, a cloud without points, NaN or
+            infinite coordinates.
+
+    Example:
+        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
+        >>> depth = torch.full((1, 2, 4, 4), float("inf")); depth[0, 0, 1, 1] = 2.0
+        >>> terms = front_terms(torch.zeros(1, 5, 3), camera, depth)
+        >>> terms.matched.tolist(), terms.observed.tolist(), terms.loss[0, 1].item()
+        ([[1, 0]], [[1, 0]], 0.0)
+    """
+    return _front_terms("front_terms", points, camera, depth, distance, tolerance, visibility)
+
+
+def _front_terms(
+    function: str,
+    points: Tensor,
+    camera: PinholeCamera,
+    depth: Tensor,
+    distance: Distance,
+    tolerance: float,
+    visibility: Method,
+) -> FrontTerms:
+    _checks.check_choice(function, "distance", distance, ("chamfer", "emd"))
+    sets = front_sets(points, camera, depth, visibility=visibility)
+    if points.shape[1] == 0:
+        raise _checks.fail(function, "points", "hold at least one point", str(tuple(points.shape)))
+    kept = sets.observed_lengths > 0
+    if not bool(kept.any()):
+        # Depends on `points`, so that the backward pass of such a batch gives zeros and does not fail.
+        loss = points.new_zeros(kept.shape) + (0 * points).sum()
+    elif bool(kept.all()):
+        loss = _compare_sets(sets, distance, tolerance)
+    else:
+        compared = _compare_sets(FrontSets(*(value[kept] for value in sets)), distance, tolerance)
+        loss = points.new_zeros(kept.shape).masked_scatter(kept, compared)
+    return FrontTerms(
+        loss,
+        sets.predicted_lengths.minimum(sets.observed_lengths),
+        sets.observed_lengths,
+        sets.fallback & kept,
+    )
+
+
+def _compare_sets(sets: FrontSets, distance: Distance, tolerance: float) -> Tensor:
+    """(*B) distances between sets that all hold at least one point."""
+    a, b, a_lengths, b_lengths = sets.predicted, sets.observed, sets.predicted_lengths, sets.observed_lengths
+    if distance == "chamfer":
+        both = chamfer_distance(a, b, squared=False, a_lengths=a_lengths, b_lengths=b_lengths)
+        return both.a_to_b + both.b_to_a
+    return earth_mover_distance(a, b, tolerance=tolerance, a_lengths=a_lengths, b_lengths=b_lengths).cost
+
+
 def front_constraint(
     points: Tensor,
     camera: PinholeCamera,
     depth: Tensor,
     *,
-    distance: Literal["chamfer", "emd"] = "chamfer",
+    distance: Distance = "chamfer",
     tolerance: float = 0.02,
     visibility: Method = "zbuffer",
     reduction: Reduction = "mean",
@@ -101,14 +191,15 @@ def front_constraint(
         reduction: "mean" over all views, or "none" for (B, V).
 
     Returns:
-        The loss in world units. A view whose depth map is empty constrains nothing: it counts 0. A view in which no
-        predicted point is visible compares the whole cloud instead, so that it is pulled in; both raise a
-        `RuntimeWarning`.
+        The loss in world units. A view whose depth map is empty has loss 0. In a view in which no predicted point is
+        visible the whole cloud is compared, which pulls it into view. Both raise a `RuntimeWarning`; `front_terms`
+        returns them instead.
 
     Gradients: to x, y and z of the visible points; none through the choice of the points.
 
     Raises:
-        ValueError, TypeError: wrong shapes, dtypes or devices, an unknown distance, NaN or infinite coordinates.
+        ValueError, TypeError: wrong shapes, dtypes or devices, an unknown distance, a cloud without points, NaN or
+            infinite coordinates.
 
     Source: CVPR 2019 paper, front constraint (section 3.2).
 
@@ -121,14 +212,10 @@ def front_constraint(
         >>> same < shifted  # not 0: the points of a pixel are compared with its centre
         True
     """
-    _checks.check_choice("front_constraint", "distance", distance, ("chamfer", "emd"))
-    sets = front_sets(points, camera, depth, visibility=visibility)
-    if points.shape[1] == 0:
-        raise _checks.fail("front_constraint", "points", "hold at least one point", str(tuple(points.shape)))
-    empty = sets.observed_lengths == 0
+    terms = _front_terms("front_constraint", points, camera, depth, distance, tolerance, visibility)
     for happened, what in (
-        (sets.fallback & ~empty, "no predicted point is visible"),
-        (empty, "the depth map is empty"),
+        (terms.fallback, "no predicted point is visible"),
+        (terms.observed == 0, "the depth map is empty"),
     ):
         if bool(happened.any()):
             where = tuple(happened.nonzero()[0].tolist())
@@ -138,24 +225,7 @@ def front_constraint(
                 RuntimeWarning,
                 stacklevel=2,
             )
-    loss = points.new_zeros(empty.shape)
-    kept = ~empty
-    if bool(kept.any()):
-        seen, observed = sets.predicted[kept], sets.observed[kept]
-        seen_lengths, observed_lengths = sets.predicted_lengths[kept], sets.observed_lengths[kept]
-        if distance == "chamfer":
-            both = chamfer_distance(
-                seen, observed, squared=False, a_lengths=seen_lengths, b_lengths=observed_lengths
-            )
-            value = both.a_to_b + both.b_to_a
-        else:
-            value = earth_mover_distance(
-                seen, observed, tolerance=tolerance, a_lengths=seen_lengths, b_lengths=observed_lengths
-            ).cost
-        loss = loss.masked_scatter(kept, value)
-    else:
-        loss = loss + 0 * points.sum()  # a gradient of 0, so that a step on such a batch does not fail
-    return reduce_loss("front_constraint", loss, reduction)
+    return reduce_loss("front_constraint", terms.loss, reduction)
 
 
 def diversity_loss(

@@ -134,13 +134,12 @@ def visible_points(
     cam_from_world: Tensor,
     size: tuple[int, int],
     *,
-    method: str,
+    filters: Tensor,
     radius: float,
-    tolerance: float,
+    limit: float,
     lengths: Tensor | None = None,
-    filters: Tensor | None = None,
 ) -> Tensor:
-    """(B, V, N): the tests of visibility one view after the other; `filters` (F, 11) and a score for "horizon"."""
+    """(B, V, N): the method "horizon"; `filters` (F, 11) score a point's horizons, and visible is at most `limit`."""
     batch, views = cam_from_world.shape[:2]
     visible = torch.zeros((batch, views, points.shape[1]), dtype=torch.bool)
     for b, v in itertools.product(range(batch), range(views)):
@@ -151,15 +150,8 @@ def visible_points(
         if len(chosen) == 0:
             continue
         aspect = float(K[b, v, 0, 0] / K[b, v, 1, 1])
-        image = image[chosen]
-        spacing = point_spacing(image, aspect)
-        if method == "horizon":
-            assert filters is not None
-            horizon, open_ = horizons(image, aspect, spacing, radius)
-            seen = open_[horizon_score(horizon, filters) <= tolerance]
-        else:
-            seen = _seen_on_map(image, size, method, radius * spacing, tolerance, spacing)
-        visible[b, v, chosen[seen]] = True
+        horizon, open_ = horizons(image[chosen], aspect, point_spacing(image[chosen], aspect), radius)
+        visible[b, v, chosen[open_[horizon_score(horizon, filters) <= limit]]] = True
     return visible
 
 
@@ -189,34 +181,6 @@ def cell_side(flat: Tensor, cells: float, longest: float, smallest: float) -> fl
     """Side of the squares that cut the extent of (n, 2) into about `cells`, neither way into more than `longest`."""
     across, down = flat.max(0).values.tolist()
     return max((across * down / cells) ** 0.5, max(across, down) / longest, smallest)
-
-
-def _seen_on_map(
-    image: Tensor, size: tuple[int, int], method: str, reach: float, tolerance: float, spacing: float
-) -> Tensor:
-    height, width = size
-    column, row = image[:, 0].long(), image[:, 1].long()
-    w = image[:, 2]
-    apart = torch.maximum((column[:, None] - column).abs(), (row[:, None] - row).abs())
-    reach = min(int(reach + 0.5), max(height, width))
-    if method == "radius":
-        front = torch.where(apart <= reach, w, torch.inf).min(1).values
-        return w <= front + tolerance * spacing
-    nearest_here = torch.where(apart == 0, w, torch.inf).min(1).values
-    tied = (apart == 0) & (w == w[:, None])
-    first = tied.to(torch.uint8).argmax(1)
-    owner = (w == nearest_here) & (first == torch.arange(len(w)))
-    if method == "pyramid":
-        side = max(reach, 2)
-        same = (column[:, None] // side == column // side) & (row[:, None] // side == row // side)
-        return owner & (w <= torch.where(same, w, torch.inf).min(1).values + tolerance * spacing)
-    gap = w[:, None] - w
-    dx, dy = column - column[:, None], row - row[:, None]
-    before = owner & (gap > 0) & (apart <= max(reach, 1)) & (apart > 0)
-    cosine = torch.where(before, gap / (gap.square() + dx.square() + dy.square()).sqrt(), 0.0)
-    sector = octant(dx, dy)
-    closed = torch.stack([torch.where(sector == k, cosine, 0.0).max(1).values for k in range(8)])
-    return owner & (closed.sum(0) <= 8 * tolerance)
 
 
 def octant(dx: Tensor, dy: Tensor) -> Tensor:

@@ -151,6 +151,7 @@ def _project(points: Tensor, projection: Tensor) -> tuple[Tensor, Tensor]:
 
 @_bridge.register(
     "project_backward",
+    strided=True,  # see `_walk`
     fake=lambda points, projection, grad_pixels, grad_depth: (
         points.new_empty(points.shape),
         projection.new_empty(projection.shape),
@@ -288,6 +289,7 @@ def _reproject(
 
 @_bridge.register(
     "reproject_backward",
+    strided=True,  # see `_walk`
     fake=lambda depth, back_projection, projection, *_: (
         depth.new_empty(depth.shape),
         back_projection.new_empty(back_projection.shape),

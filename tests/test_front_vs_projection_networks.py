@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from train.experiments.front_vs_projection.study import front_vs_projection
+from train.methods.systems import build_network
 
 from diffpoint import PinholeCamera
 from models import Generator, build_generator
@@ -19,10 +21,8 @@ from train.errors import UserError
 from train.evaluation.metrics import in_silhouette, visible_error
 from train.experiments.front_vs_projection.free_clouds import LOSSES
 from train.experiments.front_vs_projection.networks import TAUGHT, configs, densities, verdict
-from train.experiments.front_vs_projection.study import front_vs_projection
 from train.experiments.run import Workbench
 from train.methods.losses import Scene, supervise
-from train.methods.systems import build_network
 
 INFINITY = float("inf")
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from train.methods.step import autoencoder_step
+from train.training.state import Training
 
 from models import PROFILES as SIZES
 from models import Autoencoder, AutoencoderConfig, build_autoencoder, build_generator
@@ -15,9 +17,7 @@ from train.config import PROFILES
 from train.data.batches import load_split
 from train.errors import UserError
 from train.evaluation.runs import best_weights, load_autoencoder, load_generator, read_metrics
-from train.methods.step import autoencoder_step
 from train.methods.weights import save_weights
-from train.training.state import Training
 from train.training.trainer import fit
 
 _SMOKE = PROFILES["smoke"]

@@ -17,15 +17,15 @@ from typing import Any
 
 import pytest
 import torch
+from train.methods.step import training_step
+from train.training.state import Training
 
 from train.__main__ import main
 from train.config import PROFILES, Precision, fit_config_from_json
 from train.data.batches import load_split
 from train.errors import UserError
 from train.evaluation.runs import best_weights, latest_checkpoint, load_generator, read_metrics
-from train.methods.step import training_step
 from train.training import state as state_module
-from train.training.state import Training
 from train.training.trainer import fit
 
 _SMOKE = PROFILES["smoke"]
@@ -316,7 +316,9 @@ def test_resuming_with_other_data_is_refused(tiny_data: Path, smoke_run: Path) -
 
 
 def test_a_run_that_no_longer_looks_at_its_image_is_stopped(tiny_data: Path, tmp_path: Path) -> None:
-    config = dataclasses.replace(_SMOKE, health_every=2, health_patience=4, min_image_sensitivity=1e3)
+    config = dataclasses.replace(
+        _SMOKE, collapse_check_every=2, collapse_patience=4, min_image_sensitivity=1e3
+    )
     with pytest.raises(UserError, match=r"stopped at step 28: .* no longer looks at its image"):
         fit(tiny_data, tmp_path / "run", config, progress=False)
 

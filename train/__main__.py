@@ -20,11 +20,11 @@ import tyro
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 from tyro.constructors import PrimitiveConstructorSpec
 
-from train.config import PROFILES, FitConfig, System, fit_config_from_json, with_steps, with_variant
+from train.config import FitConfig, Profile, fit_config_from_json, renamed_options, with_steps
 from train.data_commands import Data
 from train.errors import UserError
 from train.experiments.registry import ABOUT_ALL, QUESTIONS
-from train.methods.recipes import with_system
+from train.methods import METHODS, recipe
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
 
@@ -48,12 +48,6 @@ Numbers = Annotated[
 
 @dataclasses.dataclass
 class Fit:
-    """Train an auto-encoder of shapes, then a generator: stage 1 on single views, stage 2 on joined views.
-
-    Ctrl-C saves and leaves. The defaults below are those of the profile and the variant; put --profile and --variant
-    before --help to see another's.
-    """
-
     data: tuple[Path, ...]
     """Root of a data tree (see the `data` command); several are put together."""
     out: Path
@@ -65,7 +59,7 @@ class Fit:
     """The same number of steps for every phase, ramps in proportion, for a quick trial."""
 
     def run(self) -> int:
-        from train.distributed import gather
+        from train.distributed import connect
         from train.training.trainer import fit
 
         config = self.config
@@ -76,11 +70,21 @@ class Fit:
         if not fit(self.data, self.out, config, resume=self.resume):
             print(f"stopped early and saved; continue with --resume --out {self.out}", file=sys.stderr)
             return 130
-        if gather().writes:
+        if connect().is_main:
             print(
                 f"trained; see {self.out}, or run: python -m train evaluate {self.out} --data {self.data[0]}"
             )
         return 0
+
+
+_METHODS = "\n\n".join(f"    {name}: {method.summary}." for name, method in METHODS.items())
+Fit.__doc__ = f"""Train an auto-encoder of shapes, then a generator: stage 1 on single views, stage 2 on joined views.
+
+    Ctrl-C saves and stops. The defaults below are those of the profile, method and variant; put --profile, --system and
+    --variant before --help to see others. Methods (--system):
+
+{_METHODS}
+    """
 
 
 @dataclasses.dataclass
@@ -238,7 +242,7 @@ class Demo:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; a user's mistake becomes one line on stderr and exit code 2."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    arguments = renamed_options(sys.argv[1:] if arguments is None else arguments)
     try:
         command = _parse(arguments)
         return command.run() or 0
@@ -254,7 +258,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(arguments: list[str]) -> Any:
-    fit = Fit(data=tyro.MISSING, out=tyro.MISSING, config=_fit_defaults(arguments))
+    # The methods' recipes import torch: only `fit` waits for that.
+    config = _fit_defaults(arguments) if arguments[:1] == ["fit"] else tyro.MISSING
+    fit = Fit(data=tyro.MISSING, out=tyro.MISSING, config=config)
     kinds = (
         Annotated[Data, subcommand("data")]
         | Annotated[Fit, subcommand("fit", default=fit)]
@@ -276,13 +282,15 @@ def _fit_defaults(arguments: list[str]) -> FitConfig:
     given = dict(itertools.pairwise(arguments))
     given |= dict(a.split("=", 1) for a in arguments if a.startswith("--") and "=" in a)
     saved = Path(given.get("--out", "")) / "config.json"
-    if arguments[:1] == ["fit"] and "--resume" in arguments and saved.is_file():
+    if "--resume" in arguments and saved.is_file():
         return fit_config_from_json(saved.read_text(), where=str(saved))
-    profile = PROFILES.get(given.get("--profile", "cpu"), PROFILES["cpu"])
-    for system in get_args(System):
-        if given.get("--system") == system:
-            profile = with_system(profile, system)
-    return with_variant(profile, "highly-diverse") if given.get("--variant") == "highly-diverse" else profile
+    profile = given.get("--profile", "cpu")
+    config = recipe(given.get("--system", "ours"), profile if profile in get_args(Profile) else "cpu")
+    if given.get("--variant") == "highly-diverse" and config.system == "ours":
+        from train.methods.ours import highly_diverse
+
+        return highly_diverse(config)
+    return config
 
 
 if __name__ == "__main__":

@@ -70,16 +70,16 @@ class LoadedSplit:
         return _picked(self.images, shapes, views).float() / 255
 
     def batch(self, shapes: Tensor, views: Tensor) -> Batch:
-        """(B,) shape and (B, V) view numbers -> what one training step needs."""
+        """(B,) shape and (B, V) view numbers -> a batch."""
         picked = (shapes[:, None], views)
         size = self.depth[0].shape[-1]
         camera = PinholeCamera(self.K[picked], self.cam_from_world[picked], size, size)
         return Batch(self.float_images(shapes, views), _picked(self.depth, shapes, views), camera)
 
-    def truth(self, shapes: Tensor) -> Truth:
-        """(B,) shape numbers -> everything known of them."""
+    def targets(self, shapes: Tensor) -> Targets:
+        """(B,) shape numbers -> their targets: clouds, and all views."""
         seen = self.batch(shapes, torch.arange(self.views).expand(len(shapes), -1))
-        return Truth(self.points[shapes], seen.depth, seen.camera)
+        return Targets(self.points[shapes], seen.depth, seen.camera)
 
     def clouds(self, shapes: Tensor, points: Tensor) -> Tensor:
         """(B,) shape and (B, N) point numbers -> (B, N, 3) of the ground truth."""
@@ -91,8 +91,8 @@ def _picked(values: Sequence[Tensor] | Tensor, shapes: Tensor, views: Tensor) ->
     return torch.stack([values[shape][chosen] for shape, chosen in zip(shapes.tolist(), views, strict=True)])
 
 
-class Truth(NamedTuple):
-    """Everything known of B shapes, with all V views that the data have of them.
+class Targets(NamedTuple):
+    """What B shapes really are: their surface, and all V views that the data have of them.
 
     Attributes:
         points: (B, P, 3) on the surface, world frame.
@@ -114,14 +114,14 @@ class Batch(NamedTuple):
         camera: (B, V), of the depth maps.
         real: (K, B, N, 3) ground truth clouds for the critic, first those of the B shapes, then of others; None
             without a critic.
-        truth: the same shapes, for methods that are taught with more than the images' own depth maps; else None.
+        targets: of the same shapes, for methods whose losses need more than the depth maps of the batch; else None.
     """
 
     images: Tensor
     depth: Tensor
     camera: PinholeCamera
     real: Tensor | None = None
-    truth: Truth | None = None
+    targets: Targets | None = None
 
 
 def load_split(

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from models import Autoencoder, Generator, Predictor
-from train.config import PROFILES, FitConfig, fit_config_from_json
+from train.config import FitConfig, fit_config_from_json
 from train.data.batches import LoadedSplit, load_split
 from train.errors import UserError
-from train.methods.recipes import with_system
-from train.methods.systems import system_of
-from train.methods.weights import PREDICTORS, read_weights
+from train.methods.weights import method_of, predictor_classes, read_weights
 
 PRETRAINED = "pretrained"
 """Names the weights that come with the repository, unless there is a file or directory of that name."""
@@ -106,7 +103,7 @@ def load_generator(run_or_file: str | Path) -> Generator:
 
 def load_predictor(run_or_file: str | Path) -> Predictor:
     """As `load_generator`, for the network of any system."""
-    return read_weights(_weights_file(Path(run_or_file)), *PREDICTORS).eval()
+    return read_weights(_weights_file(Path(run_or_file)), *predictor_classes()).eval()
 
 
 def load_autoencoder(run_or_file: str | Path) -> Autoencoder:
@@ -124,10 +121,7 @@ def config_of(run_or_file: str | Path, model: Predictor) -> FitConfig:
     file = Path(run_or_file) / "config.json"
     if file.exists():
         return fit_config_from_json(file.read_text(), where=str(file))
-    profile, system = PROFILES[model.profile], system_of(model)
-    if system != "ours":
-        return with_system(profile, system)
-    return dataclasses.replace(profile, deterministic=not model.takes_codes)
+    return method_of(model).recipe_of(model)
 
 
 def _is_shipped(path: Path) -> bool:

@@ -1,11 +1,11 @@
-"""Does agreement help? What search and descent on the codes do to the error, and why.
+"""Search and descent on the codes in detail: how each setting changes the error, and why.
 
-Every way of choosing codes is scored on the same shapes, views and first random codes. Beside them:
+Every setting is measured on the same shapes, views and first random codes. Beside them:
 
-- the floor: the consistency loss between random samples of the TRUE shape, as large as one prediction. Predictions
-  that all lay on the true surface would still disagree by about that much, because their points do not coincide;
-  a descent that goes on makes points coincide, and the joined cloud covers less.
-- the correlation of disagreement and error, over groups of random codes of one shape and over shapes.
+- the lower bound: the consistency loss between random samples of the GROUND TRUTH, as large as one prediction.
+  Predictions that all lay on the true surface would still disagree by about that much, because their points do not
+  coincide; a descent that goes on makes points coincide, and the joined cloud covers less.
+- the correlation of consistency loss and error, over groups of random codes of one shape and over shapes.
 """
 
 from __future__ import annotations
@@ -17,31 +17,29 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor
 from tqdm import tqdm
 
 from diffpoint import consistency_loss
-from train.config import InferenceConfig
+from models import Predictor
+from train.config import FitConfig, InferenceConfig
 from train.data.batches import LoadedSplit
 from train.errors import UserError
-from train.evaluation.per_shape import (
-    ShapeMetrics,
-    concatenate,
-    evaluate_split,
-    mean_metrics,
-    stack_seeds,
-    std_over_seeds,
-)
+from train.evaluation.per_shape import METRICS, evaluate_split
 from train.evaluation.runs import open_run
 from train.experiments.correlation import pearson
-from train.experiments.table import table_row
-from train.experiments.workbench import Workbench
+from train.experiments.frame import Experiment, Outcome
+from train.experiments.markdown import table_lines
+from train.experiments.statistics import spreads, stacked
+from train.experiments.store import Metrics
+from train.experiments.study import Study, unchanged
+from train.experiments.table import NAMES
 from train.show import figures
 
 _RANDOM = "random codes"
-WAYS: dict[str, InferenceConfig] = {
+SETTINGS: dict[str, InferenceConfig] = {
     _RANDOM: InferenceConfig(groups=1, steps=0),
     "best of 5 groups": InferenceConfig(groups=5, steps=0),
     "best of 20 groups": InferenceConfig(groups=20, steps=0),
@@ -53,27 +51,13 @@ WAYS: dict[str, InferenceConfig] = {
     "30 x 0.5, codes of constant length": InferenceConfig(steps=30, step_size=0.5, keep_norm=True),
     "30 x 0.5, pulled to N(0, 1)": InferenceConfig(steps=30, step_size=0.5, prior=0.02),
 }
-_GROUPS = 20
-_COLUMNS = {
-    "consistency": "consistency",
-    "gt_to_pred": "GT->pred",
-    "pred_to_gt": "pred->GT",
-    "cd": "CD",
-    "fps_gt_to_pred": "FPS GT->pred",
-    "fps_pred_to_gt": "FPS pred->GT",
-    "fps_cd": "FPS-CD",
-}
+GROUPS = 20
+_COLUMNS = ("consistency", "gt_to_pred", "pred_to_gt", "cd", "fps_gt_to_pred", "fps_pred_to_gt", "fps_cd")
+_COLOURS = {"cd": "#1f6f8b", "fps_cd": "#c8553d"}
 
 
-class _Asked(NamedTuple):
-    """One measurement: a way of choosing codes, and what is drawn.
-
-    Attributes:
-        settings: the way.
-        views: per shape.
-        seed: draws the views, and the codes if nothing else does.
-        code_seeds: each draws codes of its own.
-    """
+class _Measurement(NamedTuple):
+    """How codes are chosen, views per shape, the seed of views and codes, and seeds that draw other codes."""
 
     settings: InferenceConfig
     views: int
@@ -81,198 +65,188 @@ class _Asked(NamedTuple):
     code_seeds: tuple[int | None, ...] = (None,)
 
 
-def agreement(
-    bench: Workbench, run: Path, *, views: int, ways: Mapping[str, InferenceConfig] = WAYS
-) -> dict[str, Any]:
-    """Scores every way of choosing codes; writes agreement.json, .md and .png.
+def _config(study: Study) -> FitConfig:
+    return study.config(unchanged, seed=0)
 
-    Args:
-        bench: the first tree's test split is used; its seeds draw codes and views.
-        run: a run whose network takes codes, as `train.runs.open_run` takes it.
-        views: per shape, at least 2.
-        ways: name -> settings; must hold "random codes".
 
-    Returns:
-        What agreement.json holds.
+def make(study: Study) -> Outcome:
+    """Errors with every setting, on `study.run`, or on our method's network, trained with the first seed.
 
     Raises:
         UserError: no such run, one without codes, or numbers out of range.
     """
+    run = study.train(_config(study)) if study.run is None else study.run
     opened = open_run(run)
-    model, config = opened.model, opened.config
+    model, config, views = opened.model, opened.config, study.views
     if not model.takes_codes:
-        raise UserError(f"{run} takes no codes: there is nothing to agree on by choosing them")
-    test = bench.split(config, "test")
+        raise UserError(f"{run} takes no codes: there are none to search for")
+    test = study.split(config, "test")
     if not 2 <= views <= test.views:
         raise UserError(
-            f"--views must be between 2 and the {test.views} that {bench.scored_tree} has; got {views}"
+            f"--views must be between 2 and the {test.views} that {study.test_tree} has; got {views}"
         )
     if len(test) < 2:
-        raise UserError(f"one test shape has no spread; {bench.scored_tree} must give at least 2")
+        raise UserError(f"one test shape has no spread; {study.test_tree} must give at least 2")
 
-    seeds = range(bench.seeds)
-    of_ways = {name: [_Asked(settings, views, seed) for seed in seeds] for name, settings in ways.items()}
+    seeds = range(study.seeds)
+    of_settings = {
+        name: [_Measurement(each, views, seed) for seed in seeds] for name, each in SETTINGS.items()
+    }
     of_groups = [
-        _Asked(ways[_RANDOM], views, 0, tuple(range(first, first + _GROUPS)))
-        for first in range(1, 1 + _GROUPS * len(seeds), _GROUPS)
+        _Measurement(SETTINGS[_RANDOM], views, 0, tuple(range(first, first + GROUPS)))
+        for first in range(1, 1 + GROUPS * len(seeds), GROUPS)
     ]
-    everything = [*itertools.chain(*of_ways.values()), *of_groups]
-    bench.measure_all(_measured, [(run, asked) for asked in everything])
-    # In one process nothing is kept yet: it is measured here.
-    bar = tqdm(everything, desc="ways of choosing codes", unit="measurement", disable=not bench.progress)
-    found = {asked: _measured(bench, run, asked) for asked in bar}
-    scores = {name: concatenate([found[asked] for asked in each]) for name, each in of_ways.items()}
-    groups = concatenate([found[asked] for asked in of_groups])
-
-    result: dict[str, Any] = bench.about(config) | {
-        "profile": config.profile,  # the run's, whatever the bench would train
+    everything = [*itertools.chain(*of_settings.values()), *of_groups]
+    study.measure_all(_measured, [(run, each) for each in everything])
+    bar = tqdm(everything, desc="settings", unit="measurement", disable=not study.progress)
+    found = {each: stacked([_measured(study, run, each)]) for each in bar}  # metric -> (1, draws of codes, M)
+    values = {name: _joined([found[each] for each in every]) for name, every in of_settings.items()}
+    groups = _joined([found[each] for each in of_groups])
+    result: dict[str, Any] = study.about(config) | {
+        "profile": config.profile,  # of the run, whatever the study would train
         "run": str(run),
         "shapes": len(test),
         "fingerprint": test.fingerprint,
         "views": views,
         "floor": _floor(test, points=model.points, clouds=views),
-        "ways": {
-            name: {
-                "settings": dataclasses.asdict(ways[name]),
-                "mean": mean_metrics(found),
-                "sd_over_seeds": std_over_seeds(found),
-                "against_random": _against(found, scores[_RANDOM]),
-                "lowered_share": _lowered(found) if ways[name].steps else None,
-                "code_norm": found["code_norm"].mean().item(),
-            }
-            for name, found in scores.items()
+        "ways": {name: _summary(each, values[_RANDOM], SETTINGS[name]) for name, each in values.items()},
+        "correlation": {
+            name: _correlation(groups["consistency"], groups[name])
+            for name in _COLUMNS
+            if name != "consistency"
         },
-        "correlation": _correlation(groups),
     }
-    bench.publish("agreement", result, _markdown(result), _figure(result, groups))
-    return result
+    return Outcome(result, markdown(result), {"": _figure(result, groups)})
 
 
-def _measured(bench: Workbench, run: Path, asked: _Asked) -> ShapeMetrics:
-    """Figure -> (C, M) for each draw of codes and each shape, taken now or kept."""
+agreement = Experiment(
+    make,
+    lambda study: [_config(study)] if study.run is None else [],
+    lambda study: [] if (study.run, study.views) == (None, 8) else [str(study.run), str(study.views)],
+)
+
+
+def _takes_codes(model: Predictor) -> bool:
+    return getattr(model.config, "deterministic", True) is False
+
+
+def _measured(study: Study, run: Path, what: _Measurement) -> Metrics:
+    """Metric -> (C, M) for each draw of codes and each shape, measured now or kept."""
     opened = open_run(run)
-    test = bench.split(opened.config, "test")
-    settings, views, seed, code_seeds = asked
+    test = study.split(opened.config, "test")
+    settings, views, seed, code_seeds = what
 
-    def take() -> ShapeMetrics:
+    def measure() -> Metrics:
         draws = [
             evaluate_split(opened.model, test, settings, views=views, seed=seed, code_seed=draw)
             for draw in code_seeds
         ]
-        return {name: values.double() for name, values in stack_seeds(draws).items()}
+        return {name: torch.stack([draw[name] for draw in draws]) for name in draws[0]}
 
-    # A run's name would not do: any run can be asked about, and one that trains on gets other weights.
+    # The name of a run is not enough: any run can be given, and one that trains on gets other weights.
     weights = hashlib.sha256()
     for name, values in opened.model.state_dict().items():
         weights.update(name.encode() + values.numpy().tobytes())
-    key = [
-        "agreement",
-        weights.hexdigest(),
-        dataclasses.asdict(settings),
-        views,
-        seed,
-        code_seeds,
-        test.fingerprint,
-    ]
-    return bench.kept(key, take)
+    parts = [dataclasses.asdict(settings), views, seed, code_seeds, test.fingerprint]
+    return study.kept(["agreement", weights.hexdigest(), *parts], measure)
+
+
+def _joined(found: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Metric -> (draws, M)."""
+    return {name: np.concatenate([each[name][0] for each in found]) for name in found[0]}
 
 
 def _floor(test: LoadedSplit, *, points: int, clouds: int) -> float:
-    """Mean consistency loss x100 of disjoint random samples of the true clouds; fewer if they run out of points."""
+    """Mean consistency loss x100 of disjoint random samples of the ground truth; fewer if it has too few points."""
     generator = torch.Generator().manual_seed(0)
     clouds = min(clouds, test.points.shape[1] // points)
     if clouds < 2:
         raise UserError(
-            f"the true clouds have {test.points.shape[1]} points, too few for two samples of {points}"
+            f"the ground-truth clouds have {test.points.shape[1]} points, too few for two samples of {points}"
         )
     shuffled = torch.stack([cloud[torch.randperm(len(cloud), generator=generator)] for cloud in test.points])
     return 100 * consistency_loss(shuffled[:, : clouds * points].unflatten(1, (clouds, points))).item()
 
 
-def _against(found: ShapeMetrics, random: ShapeMetrics) -> dict[str, dict[str, float]]:
-    """Change against random codes: mean, and standard error over shapes."""
-    changes = {name: (found[name] - random[name]).double().mean(0) for name in _COLUMNS}
+def _summary(
+    found: Mapping[str, np.ndarray], random: Mapping[str, np.ndarray], settings: InferenceConfig
+) -> dict:
+    """A setting's means, their spread over draws, and the change against random codes with its standard error."""
+    by_draw = spreads({name: found[name] for name in METRICS if name in found})
+    changes = {name: (found[name] - random[name]).mean(0) for name in _COLUMNS}
     return {
-        name: {"mean": change.mean().item(), "standard_error": (change.std() / len(change) ** 0.5).item()}
-        for name, change in changes.items()
+        "settings": dataclasses.asdict(settings),
+        "mean": {name: each["mean"] for name, each in by_draw.items()},
+        "sd_over_seeds": {name: each["sd"] for name, each in by_draw.items()},
+        "against_random": {
+            name: {
+                "mean": change.mean().item(),
+                "standard_error": change.std(ddof=1).item() / len(change) ** 0.5,
+            }
+            for name, change in changes.items()
+        },
+        "lowered_share": (found["consistency"] < found["searched"]).mean().item() if settings.steps else None,
+        "code_norm": found["code_norm"].mean().item(),
     }
 
 
-def _lowered(found: ShapeMetrics) -> float:
-    return (found["consistency"] < found["searched"]).double().mean().item()
+def _correlation(loss: np.ndarray, error: np.ndarray) -> dict[str, float]:
+    """Pearson's r of consistency loss and error (draws, M): over groups of codes within a shape, and over shapes."""
+    return {
+        "within_shapes": pearson(loss.T, error.T).mean().item(),
+        "across_shapes": pearson(loss.mean(0), error.mean(0)).item(),
+    }
 
 
-def _correlation(groups: ShapeMetrics) -> dict[str, dict[str, float]]:
-    """Pearson's r of the consistency loss with each error: over groups within a shape, and over shapes."""
-
-    disagreement = groups["consistency"].double()
-    found = {}
-    for name in _COLUMNS:
-        if name == "consistency":
-            continue
-        error = groups[name].double()
-        found[name] = {
-            "within_shapes": pearson(disagreement, error).mean().item(),
-            "across_shapes": pearson(disagreement.mean(0), error.mean(0)).item(),
-        }
-    return found
-
-
-def _markdown(result: dict[str, Any]) -> str:
-    header = ["codes", *_COLUMNS.values(), "CD - random", "FPS-CD - random", "lowered"]
-    lines = [table_row(header), table_row(["---", *["---:"] * (len(header) - 1)])]
-    for name, way in result["ways"].items():
-        cells = [f"{way['mean'][column]:.2f}" for column in _COLUMNS]
-        for column in ("cd", "fps_cd"):
-            change = way["against_random"][column]
-            cells.append("" if name == _RANDOM else f"{change['mean']:+.3f} ± {change['standard_error']:.3f}")
-        lowered = way["lowered_share"]
-        lines.append(table_row([name, *cells, "" if lowered is None else f"{lowered:.1%}"]))
-    correlations = [
-        table_row(
-            ["correlation of disagreement with", "over groups of codes, within a shape", "over shapes"]
-        ),
-        table_row(["---", "---:", "---:"]),
-        *(
-            table_row([_COLUMNS[name], f"{r['within_shapes']:+.2f}", f"{r['across_shapes']:+.2f}"])
-            for name, r in result["correlation"].items()
-        ),
-    ]
-    spread = max(way["sd_over_seeds"]["cd"] or 0.0 for way in result["ways"].values())
+def markdown(result: Mapping[str, Any]) -> str:
+    """A line for every setting; correlations."""
+    sd = max(each["sd_over_seeds"]["cd"] or 0.0 for each in result["ways"].values())
     head = (
         f"{result['shapes']} test shapes, {result['views']} views, codes and views drawn "
         f"{result['seeds']} times; un-squared distances x100. Changes against random codes with their standard error "
-        f"over shapes; CD varies between draws by at most {spread:.3f} (sd). Lowered: share of "
-        "reconstructions whose consistency loss the descent lowered. Samples of the true shape, as large as one "
-        f"prediction, disagree by {result['floor']:.2f}."
+        f"over shapes; CD varies between draws by at most {sd:.3f} (sd). Lowered: share of "
+        "reconstructions whose consistency loss the descent lowered. Samples of the ground truth, as large as one "
+        f"prediction, have a consistency loss of {result['floor']:.2f}."
     )
-    return "\n".join([head, "", *lines, "", *correlations, ""])
+    rows = []
+    for name, each in result["ways"].items():
+        cells = [f"{each['mean'][column]:.2f}" for column in _COLUMNS]
+        for column in ("cd", "fps_cd"):
+            change = each["against_random"][column]
+            cells.append("" if name == _RANDOM else f"{change['mean']:+.3f} ± {change['standard_error']:.3f}")
+        lowered = each["lowered_share"]
+        rows.append([name, *cells, "" if lowered is None else f"{lowered:.1%}"])
+    titles = ["codes", *(NAMES[name] for name in _COLUMNS), "CD - random", "FPS-CD - random", "lowered"]
+    correlations = [
+        [NAMES[name], f"{r['within_shapes']:+.2f}", f"{r['across_shapes']:+.2f}"]
+        for name, r in result["correlation"].items()
+    ]
+    question = ["correlation of consistency loss with", "over groups of codes, within a shape", "over shapes"]
+    return "\n".join([head, "", *table_lines(titles, rows), "", *table_lines(question, correlations), ""])
 
 
-def _figure(result: dict[str, Any], groups: ShapeMetrics) -> Figure:
-    """Left: what each way does to the error and to the disagreement. Right: both over random groups of codes."""
+def _figure(result: Mapping[str, Any], groups: Mapping[str, np.ndarray]) -> Figure:
+    """Left: error against consistency loss of each setting. Right: both over random groups of codes."""
     figure = Figure(figsize=(12, 4.8), layout="constrained", dpi=110)
     left, right = figure.subplots(1, 2)
-    ways = result["ways"]
-    order = sorted(ways, key=lambda name: ways[name]["mean"]["consistency"])
-    disagreement = [ways[name]["mean"]["consistency"] for name in order]
-    for column, colour in (("cd", "#1f6f8b"), ("fps_cd", "#c8553d")):
-        errors = [ways[name]["mean"][column] for name in order]
-        left.plot(disagreement, errors, "o", color=colour, label=_COLUMNS[column])
-    left.axvline(result["floor"], color=figures.MUTED, ls=":", label="samples of the true shape")
-    left.set(
-        xlabel="consistency loss x100", ylabel="chamfer distance x100", title="Every way of choosing codes"
-    )
+    means = [each["mean"] for each in result["ways"].values()]
+    for column, colour in _COLOURS.items():
+        left.plot(
+            [m["consistency"] for m in means],
+            [m[column] for m in means],
+            "o",
+            color=colour,
+            label=NAMES[column],
+        )
+    left.axvline(result["floor"], color=figures.MUTED, ls=":", label="samples of the ground truth")
+    left.set(xlabel="consistency loss x100", ylabel="chamfer distance x100", title="Every setting")
     left.legend(fontsize=9)
-
-    def centred(name: str) -> Tensor:
-        return (groups[name] - groups[name].mean(0)).flatten()
-
-    for column, colour in (("cd", "#1f6f8b"), ("fps_cd", "#c8553d")):
+    centred = {name: (values - values.mean(0)).flatten() for name, values in groups.items()}
+    for column, colour in _COLOURS.items():
         r = result["correlation"][column]["within_shapes"]
         right.plot(
-            centred("consistency"), centred(column), ".", ms=3, alpha=0.4, color=colour,
-            label=f"{_COLUMNS[column]}, r = {r:+.2f}",
+            centred["consistency"], centred[column], ".", ms=3, alpha=0.4, color=colour,
+            label=f"{NAMES[column]}, r = {r:+.2f}",
         )  # fmt: skip
     right.set(
         xlabel="consistency loss, less the shape's mean",

@@ -1,14 +1,14 @@
-"""Which choices keep the network listening to its image? Short trainings, each with one choice undone.
+"""Which design choices prevent a network's predictions from ignoring the image? Short trainings, each with one undone.
 
 Every variant trains stage 1 for some steps and is measured as a run is: how far predictions move with the image and
-with the code, how much of the image trunk is silent, the validation error. What is undone is undone here: the product
-has no switch for it.
+with the code, how much of the image encoder is silent, the validation error. The choices are undone here; `fit` has no
+switch for them.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
+import functools
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,15 +21,16 @@ from tqdm import tqdm
 
 from models import Generator
 from models.parts import IMAGE_GAIN, IMAGE_MEAN
-from train.config import PROFILES, FitConfig, StageConfig
+from train.config import PROFILES, FitConfig
 from train.data.batches import LoadedSplit
 from train.errors import UserError
 from train.evaluation.runs import read_split
 from train.evaluation.sensitivity import sensitivity
+from train.experiments.frame import Experiment, Outcome
+from train.experiments.markdown import table_lines
 from train.experiments.paper import without_critic
-from train.experiments.side_by_side import run_side_by_side
-from train.experiments.workbench import Workbench, stage1_of
-from train.files import kept, write_text
+from train.experiments.study import Study, stage1_of
+from train.files import kept
 from train.methods.systems import image_size
 from train.show import figures
 from train.training.state import Training
@@ -38,10 +39,15 @@ from train.training.validation import validate
 STEPS = 500
 _MEASUREMENTS = 10
 _IMAGES = 12
+_COLUMNS = {
+    "image": "image", "code": "code", "dead_share": "silent", "matched_share": "matched", "val_cd": "CD",
+    "val_fps_cd": "FPS-CD",
+}  # fmt: skip
+_COLOURS = ("#1f6f8b", "#c8553d", "#8a6d9e", "#dd9f63", "#5a9367", "#6b7785")
 
 
 class _Uncentred(nn.Module):
-    """Gives a trunk the images as they are, in [0, 1] and mostly white."""
+    """Gives an encoder the images as they are, in [0, 1] and mostly white."""
 
     def forward(self, centred: Tensor) -> Tensor:
         return centred / IMAGE_GAIN + IMAGE_MEAN
@@ -57,19 +63,11 @@ def _initialise_as_torch_does(generator: Generator) -> None:
             module.reset_parameters()
 
 
-def _no_warmup(stage: StageConfig) -> StageConfig:
-    return dataclasses.replace(stage, warmup=0)
-
-
-def _no_ramp(stage: StageConfig) -> StageConfig:
-    return dataclasses.replace(stage, ramp=(0, 1))
-
-
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One choice undone, or several: in the schedule, and in the network that was just drawn."""
+    """Choices that are undone: values of the stage, and changes to the network with its fresh weights."""
 
-    stage: tuple[Callable[[StageConfig], StageConfig], ...] = ()
+    stage: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     network: tuple[Callable[[Generator], None], ...] = ()
 
 
@@ -77,145 +75,127 @@ VARIANTS: dict[str, Variant] = {
     "as it is": Variant(),
     "images not centred": Variant(network=(_uncentre,)),
     "torch's initialisation": Variant(network=(_initialise_as_torch_does,)),
-    "no warm-up": Variant(stage=(_no_warmup,)),
-    "diversity from step one": Variant(stage=(_no_ramp,)),
-    "all four undone": Variant((_no_warmup, _no_ramp), (_uncentre, _initialise_as_torch_does)),
+    "no warm-up": Variant({"warmup": 0}),
+    "diversity from step one": Variant({"ramp": (0, 1)}),
+    "all four undone": Variant({"warmup": 0, "ramp": (0, 1)}, (_uncentre, _initialise_as_torch_does)),
 }
 
-
-def own_trainings(bench: Workbench) -> dict[Path, FitConfig]:
-    """Every training, by the file that its measurements leave; no other experiment has a use for them."""
-    return {
-        _kept_at(bench, root, name, seed): stage1_of(_config(bench, name, seed))
-        for root, name, seed in _trainings(bench)
-    }
+Curve = list[dict[str, float]]
+"""The measurements of one training, in the order of its steps."""
 
 
-def health(bench: Workbench) -> dict[str, Any]:
-    """Trains every variant on every data tree with every seed; writes health.json, .md and .png.
-
-    Each tree is trained on alone. A training that is there already is not repeated.
-
-    Returns:
-        What health.json holds.
-    """
-    bench.need_data()
-    curves: dict[str, dict[str, list[list[dict[str, float]]]]] = {}
-    trainings = _trainings(bench)
-    missing = [training for training in trainings if not _kept_at(bench, *training).exists()]
-    if bench.processes > 1 and len(missing) > 1:
-        calls = [(bench.in_a_process(), *training) for training in missing]
-        run_side_by_side(_curve, calls, processes=bench.processes, title="trainings", progress=bench.progress)
-    for training in tqdm(trainings, desc="trainings", unit="training", disable=not bench.progress):
-        root, name, _ = training
-        curves.setdefault(root.name, {}).setdefault(name, []).append(_curve(bench, *training))
+def make(study: Study) -> Outcome:
+    """Trains every variant on every data tree by itself, with every seed."""
+    study.need_data()
+    curves: dict[str, dict[str, list[Curve]]] = {}
+    missing = [each for each in _trainings(study) if not _kept_at(study, *each).exists()]
+    study.side_by_side(_curve, missing, title="trainings")
+    for root, name, seed in tqdm(
+        _trainings(study), desc="trainings", unit="training", disable=not study.progress
+    ):
+        curves.setdefault(root.name, {}).setdefault(name, []).append(_curve(study, root, name, seed))
     result = {
-        "profile": bench.profile, "data": [str(root) for root in bench.data], "seeds": bench.seeds,
-        "steps": _steps(bench),
-        "trees": {tree: {name: _summary(runs) for name, runs in rows.items()} for tree, rows in curves.items()},
+        "profile": study.profile,
+        "data": [str(root) for root in study.data],
+        "seeds": study.seeds,
+        "steps": _steps(study),
+        "trees": {
+            tree: {name: _at_the_end(runs) for name, runs in rows.items()} for tree, rows in curves.items()
+        },
         "curves": curves,
-    }  # fmt: skip
-    write_text(bench.out / "health.json", json.dumps(result, indent=2) + "\n")
-    write_text(bench.out / "health.md", _markdown(result))
-    figures.save(_figure(result), bench.out / "health.png")
-    return result
+    }
+    return Outcome(result, markdown(result), {"": _figure(result)})
 
 
-def _trainings(bench: Workbench) -> list[tuple[Path, str, int]]:
+def _own_trainings(study: Study) -> dict[Path, FitConfig]:
+    return {_kept_at(study, *each): stage1_of(_config(study, *each[1:])) for each in _trainings(study)}
+
+
+collapse = Experiment(make, own_trainings=_own_trainings)
+
+
+def _trainings(study: Study) -> list[tuple[Path, str, int]]:
     """Data tree, variant and seed of every training."""
-    return [(root, name, seed) for root in bench.data for name in VARIANTS for seed in range(bench.seeds)]
+    return [(root, name, seed) for root in study.data for name in VARIANTS for seed in range(study.seeds)]
 
 
-def _steps(bench: Workbench) -> int:
-    return bench.steps or STEPS
+def _steps(study: Study) -> int:
+    return study.steps or STEPS
 
 
-def _config(bench: Workbench, name: str, seed: int) -> FitConfig:
-    """A variant's recipe; stage 2 is in it and is not trained."""
-    base = bench.config(without_critic, seed=seed)
-    stage = base.stage1.lasting(_steps(bench))
-    for change in VARIANTS[name].stage:
-        stage = change(stage)
+def _config(study: Study, name: str, seed: int) -> FitConfig:
+    """A variant's recipe; its stage 2 is not trained."""
+    base = study.config(without_critic, seed=seed)
+    stage = dataclasses.replace(base.stage1.lasting(_steps(study)), **VARIANTS[name].stage)
     return dataclasses.replace(base, stage1=stage)
 
 
-def _curve(bench: Workbench, root: Path, name: str, seed: int) -> list[dict[str, float]]:
-    """The measurements of one training, taken now or read."""
-    config = _config(bench, name, seed)
-
-    # The name is for people; what the measurements belong to is the configuration and the tree.
-    key = [name, dataclasses.replace(bench, data=(root,)).run_of(config).name]
-    path = _kept_at(bench, root, name, seed)
-    return kept(path, key, lambda: _train(config, VARIANTS[name], *_read(root, config)))
+def _kept_at(study: Study, root: Path, name: str, seed: int) -> Path:
+    """The file's name is for people; its measurements belong to the configuration and the tree, which are inside."""
+    return study.out / "collapse" / f"{root.name}-{name.replace(' ', '-')}-{_steps(study)}-seed{seed}.json"
 
 
-def _kept_at(bench: Workbench, root: Path, name: str, seed: int) -> Path:
-    return bench.out / "health" / f"{root.name}-{name.replace(' ', '-')}-{_steps(bench)}-seed{seed}.json"
+def _curve(study: Study, root: Path, name: str, seed: int) -> Curve:
+    """The measurements of one training, made now or kept."""
+    config = _config(study, name, seed)
+    key = [name, dataclasses.replace(study, data=(root,)).run_of(config).name]
+    read = functools.partial(read_split, config, root, image_size=image_size(config), progress=False)
+    return kept(
+        _kept_at(study, root, name, seed),
+        key,
+        lambda: _train(config, VARIANTS[name], read("train"), read("val", limit=config.validation_shapes)),
+    )
 
 
-def _read(root: Path, config: FitConfig) -> tuple[LoadedSplit, LoadedSplit]:
-    size = image_size(config)
-    val = read_split(config, root, "val", image_size=size, limit=config.validation_shapes, progress=False)
-    return read_split(config, root, "train", image_size=size, progress=False), val
-
-
-def _train(
-    config: FitConfig, variant: Variant, train: LoadedSplit, val: LoadedSplit
-) -> list[dict[str, float]]:
+def _train(config: FitConfig, variant: Variant, train: LoadedSplit, val: LoadedSplit) -> Curve:
+    """Trains stage 1 step by step, from the variant's network."""
     training = Training(config, train)
     generator = training.learner.generator
     for change in variant.network:
         change(generator)
     shapes = torch.arange(min(_IMAGES, len(val)))
     images = val.float_images(shapes, torch.zeros(len(shapes), 1, dtype=torch.long))[:, 0]
-    found: list[dict[str, float]] = []
+    found: Curve = []
     every = max(1, training.phase.steps // _MEASUREMENTS)
     while not training.done:
         try:
             report = training.advance()
-        except UserError:  # no longer finite: that is an answer too
+        except UserError:  # the loss is no longer finite: that is a result too
             found.append({"step": training.step, "image": math.nan, "code": math.nan, "dead_share": math.nan})
             break
         if training.step % every == 0 or training.done:
             now = sensitivity(generator, images, seed=config.seed)
-            record = {
+            moved = {
                 "step": training.step,
                 "image": now.image,
                 "code": now.code,
                 "dead_share": now.dead_share,
             }
-            found.append(record | {name: report[name].item() for name in ("front", "matched_share")})
+            found.append(moved | {name: report[name].item() for name in ("front", "matched_share")})
     found[-1] |= validate(generator, val, seed=config.seed)
     return found
 
 
-def _summary(runs: list[list[dict[str, float]]]) -> dict[str, Any]:
-    """What each seed's training ended with."""
-    last = [run[-1] for run in runs]
-    names = ("image", "code", "dead_share", "matched_share", "front", "val_cd", "val_fps_cd")
-    return {name: [run.get(name, math.nan) for run in last] for name in names}
+def _at_the_end(runs: list[Curve]) -> dict[str, Any]:
+    """The last measurements of each seed's training."""
+    return {name: [run[-1].get(name, math.nan) for run in runs] for name in (*_COLUMNS, "front")}
 
 
-def _markdown(result: Mapping[str, Any]) -> str:
-    head = (
-        f"Stage 1 of the profile `{result['profile']}`, {result['steps']} steps, {result['seeds']} seeds; what each "
-        "training ended with. Image, code: mean chamfer distance x100 between predictions of different images at one "
-        "code, and of different codes at one image. CD, FPS-CD: on the validation split, all views, random codes."
-    )
-    lines = [head]
-    columns = {
-        "image": "image", "code": "code", "dead_share": "silent", "matched_share": "matched", "val_cd": "CD",
-        "val_fps_cd": "FPS-CD",
-    }  # fmt: skip
+def markdown(result: Mapping[str, Any]) -> str:
+    """A table for every data tree."""
+    lines = [
+        f"Stage 1 of the profile `{result['profile']}`, {result['steps']} steps, {result['seeds']} seeds; the values "
+        "at the end of each training. Image, code: mean chamfer distance x100 between predictions for different "
+        "images with one code, and for different codes with one image. Silent: share of the encoder's channels that "
+        "are zero everywhere. Matched: share of the observed points that are assigned to a predicted point. CD, "
+        "FPS-CD: on the validation split, all views, random codes."
+    ]
     for tree, rows in result["trees"].items():
-        lines += [
-            "",
-            f"| {tree} | " + " | ".join(columns.values()) + " |",
-            "| --- |" + " ---: |" * len(columns),
+        cells = [
+            [name, *(" / ".join(f"{value:.2f}" for value in row[column]) for column in _COLUMNS)]
+            for name, row in rows.items()
         ]
-        for name, row in rows.items():
-            cells = [" / ".join(f"{value:.2f}" for value in row[column]) for column in columns]
-            lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        lines += ["", *table_lines([tree, *_COLUMNS.values()], cells)]
     return "\n".join([*lines, ""])
 
 
@@ -224,22 +204,16 @@ def _figure(result: Mapping[str, Any]) -> Figure:
     trees = result["curves"]
     figure = Figure(figsize=(6.5 * len(trees) + 2, 4.4), layout="constrained", dpi=110)
     panels = figure.subplots(1, len(trees), squeeze=False)[0]
-    colours = ("#1f6f8b", "#c8553d", "#8a6d9e", "#dd9f63", "#5a9367", "#6b7785")
+    stopped = PROFILES[result["profile"]].min_image_sensitivity
     for axes, (tree, rows) in zip(panels, trees.items(), strict=True):
-        for (name, runs), colour in zip(rows.items(), colours, strict=False):
+        for (name, runs), colour in zip(rows.items(), _COLOURS, strict=False):
             for number, run in enumerate(runs):
-                label = name if number == 0 else None
                 steps, image = [r["step"] for r in run], [r["image"] for r in run]
-                axes.plot(steps, image, ".-", color=colour, lw=1.1, label=label)
-        axes.axhline(
-            PROFILES[result["profile"]].min_image_sensitivity,
-            color=figures.MUTED,
-            ls=":",
-            label="a run is stopped below",
-        )
+                axes.plot(steps, image, ".-", color=colour, lw=1.1, label=None if number else name)
+        axes.axhline(stopped, color=figures.MUTED, ls=":", label="`fit` ends a run below this")
         axes.set(
-            title=f"{tree}: does the image matter?", xlabel="step of stage 1",
-            ylabel="predictions of different images differ by (CD x100)",
+            title=f"{tree}: effect of the image", xlabel="step of stage 1",
+            ylabel="distance of predictions for different images (CD x100)",
         )  # fmt: skip
         axes.set_yscale("symlog", linthresh=0.1)
         axes.set_ylim(-0.01, None)

@@ -1,4 +1,4 @@
-"""Which points of a cloud are hidden, by ray casting against the mesh below it; and how good a guess at them is."""
+"""Which points of a cloud are hidden, by ray casting against its mesh; and how accurate `visible_points` is."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from train.data.solids import sample_union, surface_of
 from train.data.surface import Surface
 
 EPSILON = 0.002
-"""World units: what hides a point lies at least so far before it."""
+"""World units: a point is hidden if the surface that its ray meets first is nearer by at least this."""
 VIEWS = 8
 _FRAME = 224  # pixels of a side; cameras are resized to each map
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """One shape, sampled, and what hides its samples.
+    """One shape, sampled, and how far its samples are hidden.
 
     Attributes:
         name: of the shape.
         category: of the shape.
         camera: (V,) float32.
         clouds: number of points N -> (N, 3) float32.
-        behind: number of points N -> (V, N) float64: how far each point lies behind what its ray meets first.
-        epsilon: how far a point must lie behind to be hidden.
+        behind: number of points N -> (V, N) float64: distance of each point behind what its ray meets first.
+        epsilon: from which distance a point counts as hidden.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Scene:
 
     @property
     def hidden(self) -> dict[int, Tensor]:
-        """Number of points N -> (V, N) bool: what each camera does not see."""
+        """Number of points N -> (V, N) bool: the points that each camera does not see."""
         return {count: behind > self.epsilon for count, behind in self.behind.items()}
 
 
@@ -63,7 +63,7 @@ def make_scene(
     Args:
         name: of the shape.
         category: of the shape.
-        surface: hides points. Of what lies inside it nothing need be removed: a ray from outside never meets it first.
+        surface: hides points. Faces inside it may stay: a ray from outside never meets them first.
         counts: how many points the clouds have.
         sample: draws that many points (N, 3) on the outside of the surface.
     """
@@ -104,7 +104,7 @@ class Rays:
         )
 
     def behind(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """(N,) how far each point (N, 3) lies behind what the ray to it meets first; 0 if nothing is before it."""
+        """(N,) distance of each point (N, 3) behind what the ray to it meets first; 0 if that is the point itself."""
         way = points - eye
         length = np.linalg.norm(way, axis=1)
         directions = (way / np.maximum(length, 1e-9)[:, None]).astype(np.float32)
@@ -122,10 +122,10 @@ def quality(
     radius: float | None = None,
     tolerance: float | None = None,
 ) -> dict[str, float]:
-    """How much of what `visible_points` keeps is hidden, and how much of what is visible it keeps.
+    """The share of hidden points that `visible_points` keeps, and the share of visible points that it finds.
 
     Args:
-        scenes: judged with the epsilon of each.
+        scenes: with the epsilon of each.
         count: points of the clouds.
         size: pixels of a side of the map.
         method: see `visible_points`.
@@ -133,8 +133,8 @@ def quality(
         tolerance: see `visible_points`.
 
     Returns:
-        Means over all views of all scenes: "hidden", the share of hidden points among those kept, and "recall", the
-        share of those kept among the visible ones.
+        Means over all views of all scenes: "hidden", the share of hidden points among those kept (1 - precision), and
+        "recall", the share of the visible points that are kept.
     """
     hidden_share, recall = [], []
     for scene in scenes:

@@ -1,23 +1,26 @@
-"""One page of all answers: verdicts first, then every experiment's tables and figures, from the files they left."""
+"""One page of all results: verdicts first, then every experiment's tables and figures, from the files that it wrote."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from train.errors import UserError
-from train.experiments.registry import QUESTIONS
-from train.experiments.table import claim_cells, table_row
+from train.experiments import store
+from train.experiments.markdown import table_lines
+from train.experiments.registry import EXPERIMENTS
+from train.experiments.statistics import CLAIM_ALIGNMENT, CLAIM_COLUMNS, LEVEL, claim_cells, counted
 from train.files import write_text
 
 
 def write_page(out: Path) -> Path:
-    """Puts what a directory of experiments holds, and the folders in it, on one page beside it.
+    """Puts the results in a directory of experiments, and in the folders in it, on one page beside it.
 
-    Numbers come from NAME.json and NAME.md, as the experiments wrote them. What somebody read from them by hand stands
-    beside them in NAME.reading.md, and before everything in README.md; both are taken over as they are.
+    Numbers come from NAME.json and NAME.md, as the experiments wrote them. Comments written by hand are added: those in
+    NAME.reading.md to the experiment, those in README.md to the top. Metrics are packed into one file per directory;
+    no experiment may be running there meanwhile.
 
     Args:
         out: a directory that experiments wrote into, or one with a folder for each data set.
@@ -26,50 +29,64 @@ def write_page(out: Path) -> Path:
         The page: OUT.md.
 
     Raises:
-        UserError: there is no answer in it.
+        UserError: there are no results in it.
     """
-    groups = {folder: _answers(folder) for folder in [out, *sorted(p for p in out.glob("*") if p.is_dir())]}
+    groups = {folder: _results(folder) for folder in [out, *sorted(p for p in out.glob("*") if p.is_dir())]}
     groups = {folder: found for folder, found in groups.items() if found}
     if not groups:
         raise UserError(
-            f"{out} holds no answers; make one with: python -m train experiment views --out {out} ..."
+            f"{out} holds no results; make some with: python -m train experiment views --out {out} ..."
         )
     page = out.with_name(f"{out.name}.md")
-    lines = [_taken_over(out / "README.md") or "# Results", "", "## What is claimed, and what holds here", ""]
-    lines += _summary(groups, several=len(groups) > 1)
+    lines = [_text(out / "README.md") or "# Results", "", "## Claims and verdicts", ""]
+    lines += _summary(groups)
     for folder, found in groups.items():
+        store.pack(folder)
         if folder != out:
-            lines += ["", f"## On {folder.name}", "", *_in_text(folder / "README.md")]
+            lines += ["", f"## Data: {folder.name}", "", _text(folder / "README.md")]
         for name, result in found.items():
-            lines += ["", f"{'##' if folder == out else '###'} {name}", "", f"*{QUESTIONS[name]}*", ""]
+            description = EXPERIMENTS[name].description
+            lines += ["", f"{'##' if folder == out else '###'} {name}", "", f"*{description}*", ""]
             lines += [_section(folder, name, result, page.parent)]
     write_text(page, "\n".join([*lines, ""]))
     return page
 
 
-def _answers(folder: Path) -> dict[str, dict[str, Any]]:
-    """Name -> what NAME.json holds, in the order of the questions."""
+def _results(folder: Path) -> dict[str, dict[str, Any]]:
+    """Name -> what NAME.json holds, in the order of the registry."""
     return {
         name: json.loads((folder / f"{name}.json").read_text())
-        for name in QUESTIONS
+        for name in EXPERIMENTS
         if (folder / f"{name}.json").exists() and (folder / f"{name}.md").exists()
     }
 
 
-def _summary(groups: Mapping[Path, Mapping[str, Mapping[str, Any]]], *, several: bool) -> Iterator[str]:
-    """All claims of all experiments with their verdicts."""
-    head = ["experiment", "claim", "gain", "paper's", "confidence", "verdict"]
-    yield table_row([*(["data"] if several else []), *head])
-    yield table_row([*(["---"] if several else []), "---", "---", "---:", "---:", "---:", "---"])
-    for folder, found in groups.items():
-        for name, result in found.items():
-            for claim in result.get("claims", ()):
-                yield table_row([*([folder.name] if several else []), name, *claim_cells(claim)])
+def _summary(groups: Mapping[Path, Mapping[str, Mapping[str, Any]]]) -> list[str]:
+    """All claims of all experiments with their verdicts; those of single categories are in the tables alone."""
+    claims = [
+        (folder.name, name, claim)
+        for folder, found in groups.items()
+        for name, result in found.items()
+        for claim in result.get("claims", ())
+    ]
+    several = len(groups) > 1
+    rows = [[*([data] if several else []), name, *claim_cells(claim)] for data, name, claim in claims]
+    head = [*(["data"] if several else []), "experiment", *CLAIM_COLUMNS]
+    by_chance = (1 - LEVEL) * len(claims)
+    words = (
+        f"{counted(claim for *_, claim in claims)} A claim holds if the {LEVEL:.0%} interval of its gain lies above 0, "
+        "and does not hold if it lies below. Intervals are percentiles of a paired bootstrap over shapes and "
+        "trainings; with three trainings they are approximate, and rather too short. They are not corrected for the "
+        f"number of claims: if all gains were zero, about {by_chance:.0f} of {len(claims)} would still be decided "
+        "one way or the other. A gain without an interval is of an experiment whose metrics per shape are not kept "
+        "here."
+    )
+    return [words, "", *table_lines(head, rows, "l" * (len(head) - len(CLAIM_COLUMNS)) + CLAIM_ALIGNMENT)]
 
 
 def _section(folder: Path, name: str, result: Mapping[str, Any], beside: Path) -> str:
-    """An experiment's own page, what was read from it, its pictures, and how to make them again."""
-    parts = [(folder / f"{name}.md").read_text().strip(), *_in_text(folder / f"{name}.reading.md")]
+    """An experiment's page, the comments on it, its figures, and the command that makes it again."""
+    parts = [(folder / f"{name}.md").read_text().strip(), _text(folder / f"{name}.reading.md")]
     for picture in sorted(folder.glob(f"{name}.png")) + sorted(folder.glob(f"{name}-*.png")):
         parts.append(f"![{picture.stem}]({picture.relative_to(beside).as_posix()})")
     if "profile" in result:
@@ -79,13 +96,8 @@ def _section(folder: Path, name: str, result: Mapping[str, Any], beside: Path) -
             f"`python -m train experiment {name} --data {data} --out OUT --profile {result['profile']} "
             f"--seeds {result['seeds']}{pictures}`"
         )
-    return "\n\n".join(parts)
+    return "\n\n".join(part for part in parts if part)
 
 
-def _in_text(path: Path) -> list[str]:
-    text = _taken_over(path)
-    return [text] if text else []
-
-
-def _taken_over(path: Path) -> str:
+def _text(path: Path) -> str:
     return path.read_text().strip() if path.exists() else ""

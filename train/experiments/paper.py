@@ -1,4 +1,4 @@
-"""The paper's tables: rows, the paper's figures beside them, and what they are meant to show."""
+"""The paper's tables: rows, the paper's values beside them, and what they are claimed to show."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import functools
 import torch
 
 from models import Predictor
-from train.config import FitConfig, System, with_variant
+from train.config import FitConfig, with_variant
 from train.data.batches import LoadedSplit
-from train.evaluation.per_shape import SHAPES_AT_ONCE, ShapeMetrics, compare_clouds, concatenate
+from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate
+from train.experiments.store import Metrics
+from train.experiments.study import Change, Study, of_method, unchanged
 from train.experiments.table import Claim, Row, Table, below
-from train.experiments.ten_answers import ten_answers
-from train.experiments.workbench import Change, Workbench, as_it_is
-from train.methods.recipes import with_system
+from train.experiments.ten_predictions import ten_predictions
 from train.methods.systems import METHODS
 
 
-def deterministic(config: FitConfig) -> FitConfig:
-    """The counterpart without codes."""
+def without_codes(config: FitConfig) -> FitConfig:
+    """Our method without latent codes."""
     return dataclasses.replace(config, deterministic=True)
 
 
@@ -34,7 +34,7 @@ def without_critic(config: FitConfig) -> FitConfig:
 
 
 def without_diversity(config: FitConfig) -> FitConfig:
-    """Codes, and nothing that asks shapes to differ by them."""
+    """Latent codes, and no loss that makes predictions differ by them."""
     return _both_stages(config, beta=0.0)
 
 
@@ -52,49 +52,43 @@ def _with_beta(config: FitConfig, *, beta: float) -> FitConfig:
     return dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, beta=beta))
 
 
-def of_system(system: System) -> Change:
-    """One of the methods that the paper compares itself with."""
-    return functools.partial(with_system, system=system)
-
-
 def highly_diverse(config: FitConfig) -> FitConfig:
-    """The paper's model whose predictions disagree the more."""
+    """The paper's model with more diverse predictions."""
     return with_variant(config, "highly-diverse")
 
 
 def second_stage_without_diversity(config: FitConfig) -> FitConfig:
-    """Stage 1 as it is; stage 2 does not ask shapes to differ."""
+    """Stage 1 unchanged; stage 2 without the diversity loss."""
     return dataclasses.replace(config, stage2=dataclasses.replace(config.stage2, beta=0.0))
 
 
 def second_stage_alone(config: FitConfig) -> FitConfig:
-    """Joined views from the first step, from fresh weights; the guard on the image is of stage 1."""
+    """Joined views from the first step, from fresh weights; the collapse check belongs to stage 1."""
     return dataclasses.replace(
         config, stage1=dataclasses.replace(config.stage1, steps=0), min_image_sensitivity=0.0
     )
 
 
-_RESAMPLED = "the truth, sampled again"
+_RESAMPLED = "samples of the ground truth"
 DIVERSITY = Table(
-    name="diversity",
-    title="How different are ten answers to one image?",
+    title="How different are ten predictions for one image?",
     columns=("diversity", "visible", "novelty", "critic"),
     rows=(
         *(
             Row(
-                name=name, change=change, stage=1, measure=ten_answers, judge=with_critic,
+                name=name, change=change, stage=1, measure=ten_predictions, critic_of=with_critic,
                 paper={"diversity": theirs},
             )
             for name, change, theirs in (
-                ("whole clouds (EMD) + MoN", of_system("psgn-mon"), 1.65),
+                ("whole clouds (EMD) + MoN", of_method("psgn-mon"), 1.65),
                 ("front constraint", without_diversity, 0.55),
-                ("front constraint + MoN", of_system("front-mon"), 2.52),
+                ("front constraint + MoN", of_method("front-mon"), 2.52),
                 ("diversity loss, beta 1", with_beta(1.0), 2.88),
                 ("diversity loss, beta 5", with_beta(5.0), 3.18),
-                ("diversity loss, beta 10", as_it_is, 3.36),
+                ("diversity loss, beta 10", unchanged, 3.36),
             )
         ),
-        Row(name=_RESAMPLED, answer="truth", measure=ten_answers, judge=with_critic),
+        Row(name=_RESAMPLED, source="truth", measure=ten_predictions, critic_of=with_critic),
     ),
     claims=(
         below("diversity", "front constraint", "diversity loss, beta 10", times=3),
@@ -114,22 +108,22 @@ _PTN = {"gt_to_pred": 1.86, "pred_to_gt": 2.60, "cd": 4.46}
 _R2N2 = {"gt_to_pred": 2.47, "pred_to_gt": 3.21, "cd": 5.68}
 
 
-def _perfectly_taught(row: Row, bench: Workbench, config: FitConfig) -> ShapeMetrics:
-    """What a method's kind of answer can be at best: its grid, its maps or its number of points, without an error."""
-    ideal = METHODS[config.system].ideal
-    assert ideal is not None
+def _oracle(row: Row, study: Study, config: FitConfig) -> Metrics:
+    """Errors of a method's representation of the ground truth: its grid, its maps or its number of points."""
+    represent = METHODS[config.system].ideal
+    assert represent is not None
 
-    def measure(network: Predictor, test: LoadedSplit) -> ShapeMetrics:
+    def measure(network: Predictor, test: LoadedSplit) -> Metrics:
         parts = []
         for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
-            clouds = ideal(network, test.truth(shapes))
+            clouds = represent(network, test.truth(shapes))
             parts.append(compare_clouds(clouds, test.points[shapes], points=network.points))
         return concatenate(parts)
 
-    return bench.measured(config, ["perfectly taught"], measure, stage=0)
+    return study.measure(config, ["oracle"], measure, stage=0)
 
 
-_OTHERS: tuple[tuple[str, System, int], ...] = (
+_OTHERS = (
     ("PSGN", "psgn", 8),
     ("Lin et al.", "lin", 8),
     ("PTN", "ptn", 8),
@@ -137,36 +131,35 @@ _OTHERS: tuple[tuple[str, System, int], ...] = (
 )
 
 SINGLE_CATEGORY = Table(
-    name="single-category",
     title="Which method reconstructs shapes of one category best from eight views?",
     of_one_category=True,
     columns=("gt_to_pred", "pred_to_gt", "cd", "fps_cd", "fps_pred_to_gt", "best_cd"),
     rows=(
-        Row(name="3D-R2N2", change=of_system("r2n2"), views=5, paper=_R2N2),
-        Row(name="3D-R2N2, one image", change=of_system("r2n2"), views=1),
-        Row(name="PTN", change=of_system("ptn"), paper=_PTN),
-        Row(name="PSGN", change=of_system("psgn"), paper=_PSGN),
-        Row(name="PSGN, views joined", change=of_system("psgn"), scored="joined"),
-        Row(name="Lin et al., fixed views alone", change=of_system("lin"), stage=1),
-        Row(name="Lin et al.", change=of_system("lin"), paper=_LIN),
+        Row(name="3D-R2N2", change=of_method("r2n2"), views=5, paper=_R2N2),
+        Row(name="3D-R2N2, one image", change=of_method("r2n2"), views=1),
+        Row(name="PTN", change=of_method("ptn"), paper=_PTN),
+        Row(name="PSGN", change=of_method("psgn"), paper=_PSGN),
+        Row(name="PSGN, views joined", change=of_method("psgn"), scored="joined"),
+        Row(name="Lin et al., fixed views alone", change=of_method("lin"), stage=1),
+        Row(name="Lin et al.", change=of_method("lin"), paper=_LIN),
         Row(name="ours", paper=_OURS),
         Row(name="ours, random codes", codes="random"),
-        Row(name="nearest training shape by image", answer="nearest image"),
-        Row(name="medoid of the training shapes", answer="medoid"),
-        # What is learnt by heart, and what could be: where an order comes from.
+        Row(name="nearest training shape by image", source="nearest image"),
+        Row(name="medoid of the training shapes", source="medoid"),
+        # Errors on the training shapes, and of the representation alone, help to explain an order.
         *(
-            Row(name=f"{name}, its training shapes", change=of_system(system), views=views, split="train")
-            for name, system, views in _OTHERS
+            Row(name=f"{name}, its training shapes", change=of_method(method), views=views, split="train")
+            for name, method, views in _OTHERS
         ),
         Row(name="ours, its training shapes, random codes", codes="random", split="train"),
         *(
             Row(
-                name=f"{name}, perfectly taught",
-                change=of_system(system),
-                answer="truth",
-                measure=_perfectly_taught,
+                name=f"{name}, oracle",
+                change=of_method(method),
+                source="truth",
+                measure=_oracle,
             )
-            for name, system, _ in _OTHERS
+            for name, method, _ in _OTHERS
         ),
     ),
     claims=(
@@ -183,13 +176,12 @@ SINGLE_CATEGORY = Table(
 )
 
 MULTI_CATEGORY = Table(
-    name="multi-category",
     title="One network for all categories: which method is best from eight views?",
     columns=("gt_to_pred", "pred_to_gt", "cd", "fps_cd"),
     rows=(
         # The paper's 5.68 is a mean of categories, its other figures are means of shapes.
-        Row(name="3D-R2N2", change=of_system("r2n2"), views=5, paper={"cd": 5.51}),
-        Row(name="PSGN", change=of_system("psgn"), paper={"cd": 4.39, "fps_cd": 4.39}),
+        Row(name="3D-R2N2", change=of_method("r2n2"), views=5, paper={"cd": 5.51}),
+        Row(name="PSGN", change=of_method("psgn"), paper={"cd": 4.39, "fps_cd": 4.39}),
         Row(name="ours", paper={"cd": 3.58, "fps_cd": 4.34}),
     ),
     claims=(
@@ -206,15 +198,14 @@ MULTI_CATEGORY = Table(
 )
 
 DETERMINISTIC = Table(
-    name="deterministic",
-    title="Does a random code pay, where only a fixed answer is wanted?",
+    title="Do latent codes lower the error of a single reconstruction?",
     rows=(
         Row(name="conditional", paper={"cd": 3.37, "fps_cd": 4.08}),
         Row(name="conditional, random codes", codes="random"),
         Row(name="conditional, without the diversity loss", change=without_diversity, codes="random"),
-        Row(name="deterministic", change=deterministic, paper={"cd": 3.62, "fps_cd": 4.18}),
-        Row(name="nearest training shape by image", answer="nearest image"),
-        Row(name="medoid of the training shapes", answer="medoid"),
+        Row(name="deterministic", change=without_codes, paper={"cd": 3.62, "fps_cd": 4.18}),
+        Row(name="nearest training shape by image", source="nearest image"),
+        Row(name="medoid of the training shapes", source="medoid"),
     ),
     claims=(
         below("cd", "conditional", "deterministic"),
@@ -222,13 +213,12 @@ DETERMINISTIC = Table(
         below("cd", "conditional, without the diversity loss", "deterministic"),
         below("fps_cd", "conditional, without the diversity loss", "deterministic"),
     ),
-    # Where the front hides something, a code has something to say.
+    # In the categories with hidden parts, codes may help.
     category_claims=(below("cd", "conditional", "deterministic"),),
 )
 
 CRITIC = Table(
-    name="critic",
-    title="Does the latent critic pay?",
+    title="Does the latent critic lower the error?",
     rows=(
         Row(name="without", change=without_critic),
         Row(name="with (gamma 0.1)", change=with_critic),
@@ -248,8 +238,7 @@ _BOTH, _SEARCHED, _AGREED = (
 )
 
 ABLATION = Table(
-    name="ablation",
-    title="What do the stages, the diversity loss in stage 2 and agreement on the codes add?",
+    title="What do the stages, the diversity loss in stage 2, and search and descent on the codes contribute?",
     rows=(
         Row(name=_S1, stage=1, codes="random", paper={"cd": 3.97, "fps_cd": 6.30}),
         Row(name=_S1_AGREED, stage=1, paper={"cd": 3.87, "fps_cd": 5.77}),
@@ -291,8 +280,7 @@ ABLATION = Table(
 )
 
 CONSISTENCY = Table(
-    name="consistency",
-    title="What do search and descent do for the highly diverse model?",
+    title="How do search and descent change the highly diverse model?",
     columns=("gt_to_pred", "pred_to_gt", "cd", "fps_cd", "consistency"),
     rows=(
         Row(
@@ -335,8 +323,7 @@ _PAPER_VIEWS = {
 }  # fmt: skip
 _OF_VIEWS = {n: f"{n} view{'s' if n > 1 else ''}" for n in _PAPER_VIEWS}
 VIEWS = Table(
-    name="views",
-    title="How much does each further image add?",
+    title="How much does each further image lower the error?",
     rows=tuple(
         Row(name=_OF_VIEWS[n], views=n, paper={"cd": cd, "fps_cd": fps})
         for n, (cd, fps) in _PAPER_VIEWS.items()
@@ -359,8 +346,10 @@ VIEWS = Table(
 )
 
 TABLES = {
-    table.name: table
-    for table in (
-        DIVERSITY, SINGLE_CATEGORY, MULTI_CATEGORY, DETERMINISTIC, ABLATION, CONSISTENCY, VIEWS, CRITIC
-    )
+    "diversity": DIVERSITY, "single-category": SINGLE_CATEGORY, "multi-category": MULTI_CATEGORY,
+    "deterministic": DETERMINISTIC, "ablation": ABLATION, "consistency": CONSISTENCY, "views": VIEWS, "critic": CRITIC,
 }  # fmt: skip
+
+diversity, single_category, multi_category, deterministic, ablation, consistency, views = (
+    table.experiment for name, table in TABLES.items() if name != "critic"
+)

@@ -1,132 +1,117 @@
-"""Several answers to one image: do they differ where the image does not tell?"""
+"""Several predictions for one image: do they differ more behind, where the image shows nothing, than in front?"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from diffpoint import PinholeCamera, nearest, visible_points
-from models import Generator
+from models import Generator, Predictor
 from train.data import ShapeTree
 from train.data.batches import LoadedSplit
-from train.errors import UserError
-from train.evaluation.per_shape import ShapeMetrics, concatenate, sample_predictions, stack_seeds
+from train.evaluation.per_shape import concatenate, sample_predictions
 from train.evaluation.report import make_example, pick_shapes
-from train.experiments.table import judged, table_lines, trainings
-from train.experiments.workbench import Workbench, as_it_is
+from train.experiments.frame import Experiment, Outcome
+from train.experiments.markdown import table_lines
+from train.experiments.statistics import claim, spreads, stacked, trainings
+from train.experiments.store import Metrics
+from train.experiments.study import Study, unchanged
 from train.show import figures
 
 CODES = 6
 SHOWN_CODES, SHOWN_SHAPES = 5, 6
 LEAST_RATIO = 1.5
-"""How much more the back has to vary than the front."""
+"""Claimed: the back varies by more than this times the variation of the front."""
 
 
-def predictions(bench: Workbench) -> dict[str, Any]:
-    """Draws what several codes make of one image, and measures where they differ; writes predictions.json, .md, .png.
-
-    Each held-out shape shows one view, which the seed draws; the figure's shapes show their front. See `spread`.
-
-    Returns:
-        What predictions.json holds: "front", "back" (x100) and "ratio" over all shapes and by category, and the share
-        of bootstrap samples, over trainings and shapes, in which the back varies more than 1.5 times as much.
-    """
-    configs = bench.configs(as_it_is)
-    bench.train_all(configs)
-    test = bench.split(configs[0], "test")
-    by_seed = []
-    for config in configs:
-        key = ["spread", bench.run_of(config).name, CODES, test.fingerprint]
-        model = _generator(bench, config)
-        by_seed.append(bench.kept(key, lambda model=model, seed=config.seed: _spreads(model, test, seed)))
-    scores = stack_seeds(by_seed)
-    names = list(dict.fromkeys(test.categories))
-    result = bench.about(configs[0]) | {
+def make(study: Study) -> Outcome:
+    """The metrics of `variation` over all shapes and by category; each shape shows one view, which the seed draws."""
+    configs = study.configs(unchanged)
+    study.train_all(configs)
+    test = study.split(configs[0], "test")
+    per_shape = stacked([_measured(study, config) for config in configs])
+    categories = np.array(test.categories)
+    result = study.about(configs[0]) | {
         "shapes": len(test),
         "codes": CODES,
-        "all": _summary(scores),
+        "all": _summary(per_shape, slice(None)),
         "categories": {
-            name: _summary({k: v[:, [c == name for c in test.categories]] for k, v in scores.items()})
-            for name in names
+            name: _summary(per_shape, categories == name) for name in dict.fromkeys(test.categories)
         },
         "claims": [
-            judged(
+            claim(
                 f"the back varies more than {LEAST_RATIO} times as much as the front",
-                scores["back"] - LEAST_RATIO * scores["front"],
+                per_shape["back"] - LEAST_RATIO * per_shape["front"],
             )
         ],
     }
-    bench.publish("predictions", result, _markdown(result), _figure(bench))
-    return result
+    return Outcome(result, markdown(result), {"": _figure(study)})
 
 
-def spread(clouds: Tensor, camera: PinholeCamera) -> dict[str, Tensor]:
-    """How far several predictions of one image are apart, in the front and in the back.
+predictions = Experiment(make, lambda study: study.configs(unchanged))
 
-    Point n of every prediction comes from the same output of the network, so that points correspond. A point is of
-    the front if the image's camera sees it in the mean cloud (`visible_points`, "horizon", which does not let the
-    back shine through between 512 points), else of the back.
+
+def _measured(study: Study, config: Any) -> Metrics:
+    def measure(model: Predictor, test: LoadedSplit) -> Metrics:
+        found = sample_predictions(model, test, codes=CODES, seed=config.seed)
+        return concatenate([variation(clouds, shown.camera) for _, shown, clouds in found])
+
+    return study.measure(config, ["variation", CODES], measure)
+
+
+def variation(clouds: Tensor, camera: PinholeCamera) -> dict[str, Tensor]:
+    """How far several predictions for one image are apart, in front and behind.
+
+    Point n of every prediction comes from the same output of the network, so that points correspond. A point is in
+    front if the image's camera sees it in the mean cloud (`visible_points`, "horizon", which hides the back also where
+    the points in front are sparse), else behind.
 
     Args:
-        clouds: (R, B, N, 3) R predictions of each of B images, world frame.
+        clouds: (R, B, N, 3) R predictions for each of B images, world frame.
         camera: (B, 1) the images' cameras.
 
     Returns:
-        Each (B,), x100: "front" and "back", the mean distance of a point from its mean place; "front_surface" and
-        "back_surface", its mean distance from the nearest point of another prediction, which sliding along the surface
-        does not raise, but the spacing of the points bounds from below. And "front_share", of the points.
+        Each (B,), x100: "front" and "back", the mean distance of a point from its mean position; "front_surface" and
+        "back_surface", its mean distance to the nearest point of another prediction, which sliding along the surface
+        does not raise, and which the spacing of the points bounds from below. And "front_share", of the points.
     """
-    count = len(clouds)
     mean = clouds.mean(0)
     front = visible_points(mean.contiguous(), camera, method="horizon")[:, 0]
-    away = {"": (clouds - mean).norm(dim=-1).mean(0)}
-    others = [nearest(clouds, clouds.roll(step, 0)).squared_distance.sqrt() for step in range(1, count)]
-    away["_surface"] = torch.stack(others).mean((0, 1))
+    distances = {"": (clouds - mean).norm(dim=-1).mean(0)}
+    others = [nearest(clouds, clouds.roll(step, 0)).squared_distance.sqrt() for step in range(1, len(clouds))]
+    distances["_surface"] = torch.stack(others).mean((0, 1))
     found = {
         f"{side}{kind}": 100 * (values * chosen).sum(-1) / chosen.sum(-1).clamp(min=1)
-        for kind, values in away.items()
+        for kind, values in distances.items()
         for side, chosen in (("front", front), ("back", ~front))
     }
     return found | {"front_share": front.to(mean.dtype).mean(-1)}
 
 
-def _spreads(model: Generator, test: LoadedSplit, seed: int) -> ShapeMetrics:
-    answered = sample_predictions(model, test, codes=CODES, seed=seed)
-    found = concatenate([spread(clouds, shown.camera) for _, shown, clouds in answered])
-    return {name: values.double() for name, values in found.items()}
-
-
-def _generator(bench: Workbench, config: Any) -> Generator:
-    model = bench.network(config)
-    if not isinstance(model, Generator):
-        raise UserError("only our own system takes codes")
-    return model
-
-
-def _summary(scores: Mapping[str, Tensor]) -> dict[str, Any]:
-    found: dict[str, Any] = {"shapes": scores["front"].shape[1]}
+def _summary(per_shape: Mapping[str, np.ndarray], shapes: Any) -> dict[str, Any]:
+    found: dict[str, Any] = {"shapes": per_shape["front"][:, shapes].shape[1]}
+    means = {name: np.array(each["by_seed"]) for name, each in spreads(per_shape, shapes).items()}
     for kind in ("", "_surface"):
-        front, back = scores[f"front{kind}"].mean(1), scores[f"back{kind}"].mean(1)
-        found |= {f"front{kind}": front.mean().item(), f"back{kind}": back.mean().item()}
-        found |= {
-            f"ratio{kind}": (back / front).mean().item(),
-            f"ratio{kind}_by_seed": (back / front).tolist(),
-        }
-    return found | {"front_share": scores["front_share"].mean().item()}
+        ratio = means[f"back{kind}"] / means[f"front{kind}"]
+        found |= {f"{side}{kind}": means[f"{side}{kind}"].mean().item() for side in ("front", "back")}
+        found |= {f"ratio{kind}": ratio.mean().item(), f"ratio{kind}_by_seed": ratio.tolist()}
+    return found | {"front_share": means["front_share"].mean().item()}
 
 
-def _markdown(result: Mapping[str, Any]) -> str:
+def markdown(result: Mapping[str, Any]) -> str:
+    """A line for all shapes, and for every category."""
+    (found,) = result["claims"]
     head = (
         f"{result['codes']} codes for one image of each of {result['shapes']} held-out shapes, profile "
-        f"`{result['profile']}`, {trainings(result['seeds'])}. Spread x100: mean distance of a point "
-        "from its mean place over the codes, for "
-        "the points that the image's camera sees and for those behind; surface: from the nearest point of "
-        f"another prediction. The back varies more than {LEAST_RATIO} times as much as the front in "
-        f"{result['claims'][0]['confidence']:.1%} of the bootstrap samples over trainings and shapes."
+        f"`{result['profile']}`, {trainings(result['seeds'])}. Variation x100: mean distance of a point from its mean "
+        "position over the codes, for the points that the image's camera sees and for the others; surface: to the "
+        f"nearest point of another prediction. Claim: {found['words']}; it "
+        f"{found['verdict'].replace('undecided', 'is undecided')}."
     )
     rows = [
         [
@@ -143,10 +128,11 @@ def _markdown(result: Mapping[str, Any]) -> str:
     return "\n".join([head, "", *table_lines(columns, rows), ""])
 
 
-def _figure(bench: Workbench) -> Figure:
-    config = bench.config(as_it_is, seed=0)
-    model = _generator(bench, config)
-    tree = ShapeTree(bench.scored_tree, "test", list(config.categories) or None)
+def _figure(study: Study) -> Figure:
+    config = study.config(unchanged, seed=0)
+    tree = ShapeTree(study.test_tree, "test", list(config.categories) or None)
+    model = study.network(config)
+    assert isinstance(model, Generator)
     examples = [
         make_example(model, shape, config, seed=0, codes=SHOWN_CODES)
         for shape in pick_shapes(tree, SHOWN_SHAPES)

@@ -1,32 +1,77 @@
-"""What `train experiment` can be asked: names and a line for each, without importing anything that measures."""
+"""The experiments: a new one is a file with an `Experiment`, and a line here. Nothing is imported before it is used."""
 
 from __future__ import annotations
 
-QUESTIONS = {
-    "diversity": "how different are ten answers to one image, by training loss? (the paper's table 1)",
-    "single-category": "our system and four others on shapes of one --category, from eight views",
-    "multi-category": "one network for all categories: ours, PSGN and 3D-R2N2, category by category",
-    "deterministic": "our system beside its counterpart without codes",
-    "ablation": "what stage 1, stage 2, diversity in it, search and descent add",
-    "consistency": "search and descent on the highly diverse model",
-    "correlation": "does disagreement tell the error, over shapes and over groups of codes?",
-    "views": "the error from 1 to 8 images",
-    "runtime": "time of view sampling, and how much of what it selects is hidden",
-    "predictions": "several codes for one image: do they differ where the image does not tell?",
-    "reconstructions": "pictures: reconstructions from eight views beside other methods",
-    "one-armed": "does a network without codes invent the hidden arm of a chair, and ours with two views not?",
-    "coverage": "do the codes reach all backs that a front can have, and is anything drawn that is none of them?",
-    "critic": "with the latent critic and without",
-    "agreement": "search and descent in detail: step sizes, steps, groups and restraints",
-    "health": "which choices keep a network listening to its image",
-    "front-vs-projection": "free clouds and networks, moved by the front constraint and by projection losses",
-    "photos": "pictures: what our system makes of your own photographs (--pictures)",
+import importlib
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from train.experiments.frame import Experiment
+
+
+class Entry(NamedTuple):
+    """A description in a line, and where the experiment is: "module:name", relative to train.experiments."""
+
+    description: str
+    where: str
+
+
+EXPERIMENTS = {
+    "diversity": Entry(
+        "diversity of ten predictions for one image, by training loss (the paper's table 1)",
+        "paper:diversity",
+    ),
+    "single-category": Entry(
+        "five methods on the shapes of one --category, eight views", "paper:single_category"
+    ),
+    "multi-category": Entry(
+        "one network for all categories: ours, PSGN and 3D-R2N2, by category", "paper:multi_category"
+    ),
+    "deterministic": Entry("our method with and without latent codes", "paper:deterministic"),
+    "ablation": Entry("effect of stage 1, stage 2, its diversity loss, search and descent", "paper:ablation"),
+    "consistency": Entry("search and descent on the highly diverse model", "paper:consistency"),
+    "correlation": Entry(
+        "correlation of consistency loss and error, over shapes and over groups of codes",
+        "correlation:correlation",
+    ),
+    "views": Entry("error for 1 to 8 images", "paper:views"),
+    "runtime": Entry("time of view-based sampling, and share of hidden points it selects", "runtime:runtime"),
+    "predictions": Entry(
+        "do predictions with different codes differ more behind than in front?", "predictions:predictions"
+    ),
+    "reconstructions": Entry(
+        "figure: reconstructions from eight views, three methods", "reconstructions:reconstructions"
+    ),
+    "one-armed": Entry(
+        "does the deterministic network invent the hidden arm rest of a chair, and does ours avoid it with two views?",
+        "one_armed.measure:one_armed",
+    ),
+    "coverage": Entry(
+        "do predictions reach all backs that a front can have, and are any unlike all of them?",
+        "coverage:coverage",
+    ),
+    "critic": Entry("training with and without the latent critic", "critic:critic"),
+    "agreement": Entry(
+        "search and descent in detail: step sizes, steps, groups, regularisation", "agreement:agreement"
+    ),
+    "collapse": Entry("which design choices prevent predictions that ignore the image", "collapse:collapse"),
+    "front-vs-projection": Entry(
+        "front constraint against projection losses, on free point clouds and in networks",
+        "front_vs_projection.experiment:front_vs_projection",
+    ),
+    "photos": Entry("figure: reconstructions of your own photographs (--pictures)", "photos:photos"),
 }
-"""Name of an experiment -> its question, in the order in which `all` takes them."""
+"""Name -> entry, in the order in which `all` makes them."""
 
 ABOUT_ALL = {
-    "list": "what there is, what of it is done, and how long the rest will take",
-    "all": "everything that is not done yet, one after the other",
-    "page": "puts what --out holds, and the folders in it, on one page beside it: OUT.md",
+    "list": "status of every experiment, and how long the missing trainings will take",
+    "all": "makes every experiment that is not done yet",
+    "page": "puts the results in --out, and in the folders in it, on one page beside it: OUT.md",
 }
-"""What is asked of all experiments together."""
+"""Commands on all experiments together."""
+
+
+def load(name: str) -> Experiment:
+    """Imports an experiment."""
+    module, attribute = EXPERIMENTS[name].where.split(":")
+    return getattr(importlib.import_module(f"train.experiments.{module}"), attribute)

@@ -1,4 +1,4 @@
-"""How long does view based sampling take, and how much of what it selects is hidden?
+"""How long does view-based sampling take, and how many of the points that it selects are hidden?
 
 The paper gives one time and one share for clouds of 2048 and of 10 000 points, and no size of the map; here is a grid.
 """
@@ -9,11 +9,11 @@ import dataclasses
 import itertools
 import os
 import platform
-import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from matplotlib.figure import Figure
 from scipy.spatial import Delaunay
@@ -23,9 +23,11 @@ from diffpoint import runtime_info, sample_view, splat_depth, visible_points
 from diffpoint.visibility import Method
 from train.data.families import FAMILIES
 from train.data.render import Orbit
+from train.experiments.frame import Experiment, Outcome
 from train.experiments.hidden_points import EPSILON, VIEWS, Scene, embedded_scene, quality
-from train.experiments.table import claim_lines, judged, table_lines
-from train.experiments.workbench import Workbench
+from train.experiments.markdown import table_lines
+from train.experiments.statistics import claim, claim_lines
+from train.experiments.study import Study
 from train.files import kept
 from train.show import figures
 
@@ -33,11 +35,11 @@ PAPER = {
     2048: {"hidden": 0.104, "zbuffer": 6.6, "triangulation": 209.8},
     10_000: {"hidden": 0.036, "zbuffer": 10.2, "triangulation": 1120.0},
 }
-"""What the paper says, by number of points: the hidden share; ms of its sampling on a GPU and of triangulating."""
+"""The paper, by number of points: the hidden share; ms of its sampling on a GPU and of triangulating."""
 COUNTS = tuple(PAPER)
 SIDES = (28, 56, 112, 224)  # pixels
 HEADLINES = (56, 28)
-"""Sides of the maps in the words; the first is the released code's, and timed. The paper states none."""
+"""Sides of the maps in the text; the first is the released code's, and timed. The paper states none."""
 EPSILONS = (EPSILON, 0.02)
 METHODS: tuple[Method, ...] = ("zbuffer", "horizon")
 _ROUNDS, _QUICK_ROUNDS = (31, 3), (3, 1)
@@ -48,25 +50,25 @@ _COLOURS = ("#1f6f8b", "#c8553d")
 _STYLES = {"zbuffer": ("z-buffer", "o-"), "horizon": ("horizon", "s--")}
 
 
-def runtime(bench: Workbench) -> dict[str, Any]:
-    """Times view based sampling and judges what it selects; trains nothing. Writes runtime.json, .md and .png.
+def make(study: Study) -> Outcome:
+    """Times view-based sampling and judges what it selects; trains nothing.
 
-    The shapes are embedded ones, one of each family, up to `bench.limit` of them; with `bench.steps`, times are of a
-    few runs. Shares are kept; times are taken anew at each call, since they are of the machine as it is.
+    The shapes are procedural ones, one of each family, up to `study.limit` of them; with `study.steps`, times are of a
+    few repetitions. Shares are kept; times are measured at each call, since they depend on the machine at that moment.
 
     Returns:
-        What runtime.json holds: "time", in ms; "grid", a row for each epsilon, number of points, side of the map and
-        method; "base", the hidden share of all points; "paper", its figures.
+        "time", in ms; "grid", a row for each epsilon, number of points, side of the map and method; "base", the hidden
+        share of all points; "paper", its values.
 
     Raises:
-        UserError: embree, which finds what is hidden, does not run here.
+        UserError: embree, which casts the rays, does not run here.
     """
-    families = list(FAMILIES)[: bench.limit]
+    families = list(FAMILIES)[: study.limit]
     scenes = [embedded_scene(family, _SEED, COUNTS) for family in families]
     key = [families, _SEED, VIEWS, list(COUNTS), list(SIDES), list(METHODS), list(EPSILONS)]
-    found = kept(bench.out / "runtime" / "hidden.json", key, lambda: _hidden(scenes))
-    rounds = _ROUNDS if bench.steps is None else _QUICK_ROUNDS
-    times = [_times(scenes, count, rounds, progress=bench.progress) for count in COUNTS]
+    found = kept(study.out / "runtime" / "hidden.json", key, lambda: _hidden(scenes))
+    rounds = _ROUNDS if study.steps is None else _QUICK_ROUNDS
+    times = [_times(scenes, count, rounds, progress=study.progress) for count in COUNTS]
     result = {
         "machine": _machine(),
         "shapes": families,
@@ -75,36 +77,39 @@ def runtime(bench: Workbench) -> dict[str, Any]:
         "sides": list(SIDES),
         "timed": {"side": HEADLINES[0], "rounds": list(rounds)},
         "time": times,
-        "claims": [_faster(row) for row in times],
+        "claims": claims(times),
         **found,
         "paper": [{"points": count, **_with_ratio(PAPER[count])} for count in COUNTS],
     }
-    bench.publish("runtime", result, _markdown(result), _figure(result))
-    return result
+    return Outcome(result, markdown(result), {"": _figure(result)})
+
+
+runtime = Experiment(make)
 
 
 def medians(
-    runs: Mapping[Any, Callable[[], Any]], *, rounds: int, clock: Callable[[], float] = time.perf_counter
+    functions: Mapping[Any, Callable[[], Any]], *, rounds: int, clock: Callable[[], float] = time.perf_counter
 ) -> dict[Any, float]:
-    """Median milliseconds of several things to run, in turns, so that a noisy machine is noisy for all of them."""
-    durations = {name: [] for name in runs}
-    for run in runs.values():
-        run()
+    """Median milliseconds of several functions, called in turns, so that other load on the machine affects all of
+    them."""
+    durations = {name: [] for name in functions}
+    for function in functions.values():
+        function()
     for _ in range(rounds):
-        for name, run in runs.items():
+        for name, function in functions.items():
             start = clock()
-            run()
+            function()
             durations[name].append(1e3 * (clock() - start))
-    return {name: statistics.median(each) for name, each in durations.items()}
+    return {name: float(np.median(each)) for name, each in durations.items()}
 
 
 def _times(scenes: Sequence[Scene], count: int, rounds: tuple[int, int], *, progress: bool) -> dict[str, Any]:
     """Milliseconds of one cloud in one view: the median over shapes, and each."""
     bar = tqdm(scenes, desc=f"times, {count} points", unit="shape", disable=not progress)
     by_shape = [_times_of(scene, count, rounds) for scene in bar]
-    spread = {name: [milliseconds[name] for milliseconds in by_shape] for name in by_shape[0]}
-    middle = {name: statistics.median(each) for name, each in spread.items()}
-    return {"points": count, **_with_ratio(middle), "by_shape": spread}
+    each = {name: [milliseconds[name] for milliseconds in by_shape] for name in by_shape[0]}
+    middle = {name: float(np.median(values)) for name, values in each.items()}
+    return {"points": count, **_with_ratio(middle), "by_shape": each}
 
 
 def _times_of(scene: Scene, count: int, rounds: tuple[int, int]) -> dict[str, float]:
@@ -114,21 +119,27 @@ def _times_of(scene: Scene, count: int, rounds: tuple[int, int]) -> dict[str, fl
         "zbuffer": lambda: sample_view(cloud, splat_depth(cloud, camera)),
         "horizon": lambda: sample_view(cloud, visible_points(cloud, camera, method="horizon")),
     }
-    # In turns by shape only: what runs right after a triangulation finds cold caches, and takes twice its time. And by
-    # its thread's time: on a busy machine the clock would count others' work in long runs, and not in short ones.
+    # In turns by shape only: what is called right after a triangulation finds cold caches, and takes twice its time.
+    # And in the thread's time: on a busy machine, wall-clock time would include other load in long calls and not in
+    # short ones.
     found = medians(sampling, rounds=rounds[0])
     return found | medians({"triangulation": lambda: Delaunay(xyz)}, rounds=rounds[1], clock=time.thread_time)
 
 
-def _faster(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Is sampling ten times faster than triangulating? Over shapes."""
-    z_buffer, triangulation = (
-        torch.tensor([row["by_shape"][name]], dtype=torch.float64) for name in ("zbuffer", "triangulation")
-    )
-    paper = PAPER[row["points"]]
-    words = f"ms, {row['points']} points: 10 x z-buffer sampling < triangulation"
-    gain = paper["triangulation"] - 10 * paper["zbuffer"]
-    return judged(words, triangulation - 10 * z_buffer, paper_gain=gain)
+def claims(times: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Is sampling ten times faster than triangulating? Over shapes, for every number of points."""
+    found = []
+    for row in times:
+        paper = PAPER[row["points"]]
+        z_buffer, triangulation = (np.array([row["by_shape"][name]]) for name in ("zbuffer", "triangulation"))
+        found.append(
+            claim(
+                f"ms, {row['points']} points: 10 x z-buffer sampling < triangulation",
+                triangulation - 10 * z_buffer,
+                paper_gain=paper["triangulation"] - 10 * paper["zbuffer"],
+            )
+        )
+    return found
 
 
 def _with_ratio(times: Mapping[str, float]) -> dict[str, float]:
@@ -137,14 +148,13 @@ def _with_ratio(times: Mapping[str, float]) -> dict[str, float]:
 
 def _hidden(scenes: Sequence[Scene]) -> dict[str, Any]:
     base, grid = [], []
-    for epsilon in EPSILONS:
+    for epsilon, count in itertools.product(EPSILONS, COUNTS):
         judged = [dataclasses.replace(scene, epsilon=epsilon) for scene in scenes]
-        for count in COUNTS:
-            row = {"epsilon": epsilon, "points": count}
-            of_all = torch.stack([scene.hidden[count] for scene in judged]).double().mean().item()
-            base.append(row | {"hidden": of_all})
-            for side, method in itertools.product(SIDES, METHODS):
-                grid.append(row | {"side": side, "method": method, **quality(judged, count, side, method)})
+        row = {"epsilon": epsilon, "points": count}
+        of_all = torch.stack([scene.hidden[count] for scene in judged]).double().mean().item()
+        base.append(row | {"hidden": of_all})
+        for side, method in itertools.product(SIDES, METHODS):
+            grid.append(row | {"side": side, "method": method, **quality(judged, count, side, method)})
     return {"base": base, "grid": grid}
 
 
@@ -163,19 +173,20 @@ def _rows(result: Mapping[str, Any], **wanted: Any) -> list[dict[str, Any]]:
     return [row for row in result["grid"] if all(row[name] == value for name, value in wanted.items())]
 
 
-def _markdown(result: Mapping[str, Any]) -> str:
+def markdown(result: Mapping[str, Any]) -> str:
+    """Times, claims, shares, and a summary in words."""
     (low, high), machine, timed = result["elevation_deg"], result["machine"], result["timed"]
     head = (
-        f"{_about(result)}, embedded families, elevations between {low:g} and {high:g} degrees. A point is hidden if "
-        "the way to it from the camera meets the mesh more than eps (world units) before it. Selected: by the paper's "
-        "z-buffer, or by this library's `horizon`, which does not depend on the map's size."
+        f"{_about(result)}, procedural families, elevations between {low:g} and {high:g} degrees. A point is hidden if "
+        "the ray from the camera to it meets the mesh more than eps (world units) before it. Selected: by the paper's "
+        "z-buffer, or by this library's `horizon`, which does not depend on the size of the map."
     )
     how = (
         f"Milliseconds for one cloud in one view: `splat_depth` ({timed['side']} x {timed['side']}) or `horizon`, and "
-        "`sample_view`; beside it the cloud's triangulation by `scipy.spatial.Delaunay` in 3D, which does not yet say "
-        f"what is hidden. Medians over shapes of medians of {timed['rounds'][0]} runs by the clock, and of "
-        f"{timed['rounds'][1]} triangulations in processor time. {machine['processor']}, {machine['cores']} cores; the "
-        "paper: a GPU."
+        "`sample_view`; besides, triangulation of the cloud by `scipy.spatial.Delaunay` in 3D, which alone does not "
+        f"yet determine what is hidden. Medians over shapes of medians of {timed['rounds'][0]} calls in wall-clock "
+        f"time, and of {timed['rounds'][1]} triangulations in processor time. {machine['processor']}, "
+        f"{machine['cores']} cores; the paper: a GPU."
     )
     times, shares = [], []
     for ours, paper in zip(result["time"], result["paper"], strict=True):
@@ -193,35 +204,39 @@ def _markdown(result: Mapping[str, Any]) -> str:
             shares.append([title, *cells, f"{base['hidden']:.1%}", theirs])
     lines = [head, "", how, "", *table_lines(["", "z-buffer", "horizon", "triangulation", _RATIO], times)]
     lines += ["", *claim_lines(result["claims"])]
-    lines += ["", "Hidden points among those selected / selected points among those visible:", ""]
+    lines += [
+        "",
+        "Share of hidden points among the selected / share of selected points among the visible:",
+        "",
+    ]
     sides = [f"{side} x {side}" for side in result["sides"]]
     lines += table_lines(["", *sides, "hidden of all", "paper, hidden"], shares)
-    return "\n".join([*lines, "", _reading(result), ""])
+    return "\n".join([*lines, "", _summary(result), ""])
 
 
-def _reading(result: Mapping[str, Any]) -> str:
+def _summary(result: Mapping[str, Any]) -> str:
     """The tables in words; each pair of numbers is of the two numbers of points."""
     paper, epsilon = result["paper"], result["base"][0]["epsilon"]
     first, second = (_rows(result, method="zbuffer", side=side, epsilon=epsilon) for side in HEADLINES)
     horizon = _rows(result, method="horizon", side=HEADLINES[0], epsilon=epsilon)
     settings = _rows(result, method="zbuffer", points=paper[0]["points"])
     maps = [_rows(result, method="zbuffer", side=r["side"], epsilon=r["epsilon"]) for r in settings]
-    nearest = min(maps, key=lambda rows: _away(rows, paper))
+    nearest = min(maps, key=lambda rows: _difference(rows, paper))
     size, halved, best = (f"{rows[0]['side']} x {rows[0]['side']}" for rows in (first, second, nearest))
     return (
-        f"For {' and '.join(map(_points, paper))}, view based sampling is {_pair(result['time'], _RATIO, '.0f')} times "
+        f"For {' and '.join(map(_points, paper))}, view-based sampling is {_pair(result['time'], _RATIO, '.0f')} times "
         f"as fast as the triangulation (the paper: {_pair(paper, _RATIO, '.0f')}). At eps {epsilon}, "
         f"{_pair(first, 'hidden')} of what the z-buffer selects is hidden with maps of {size}, "
         f"{_pair(second, 'hidden')} with {halved}; of all maps and eps, {best} at {nearest[0]['epsilon']} comes "
-        f"nearest to the paper's {_pair(paper, 'hidden')}, with {_pair(nearest, 'hidden')}: "
-        f"{100 * _away(nearest, paper):.1f} percentage points off in the worse one. `horizon` finds "
+        f"nearest to the paper's {_pair(paper, 'hidden')}, with {_pair(nearest, 'hidden')}: at most "
+        f"{100 * _difference(nearest, paper):.1f} percentage points of difference. `horizon` finds "
         f"{_pair(horizon, 'recall')} of the visible points, and {_pair(horizon, 'hidden')} of what it selects is "
         f"hidden; the z-buffer of {size} finds {_pair(first, 'recall')}."
     )
 
 
-def _away(rows: Sequence[Mapping[str, Any]], paper: Sequence[Mapping[str, Any]]) -> float:
-    """How far the hidden shares are from the paper's, in the worse case."""
+def _difference(rows: Sequence[Mapping[str, Any]], paper: Sequence[Mapping[str, Any]]) -> float:
+    """Of the hidden shares from the paper's, the larger one."""
     return max(abs(ours["hidden"] - theirs["hidden"]) for ours, theirs in zip(rows, paper, strict=True))
 
 
@@ -257,5 +272,5 @@ def _figure(result: Mapping[str, Any]) -> Figure:
         axes.set(xlabel="side of the map, pixels", ylim=(0, None))
         figures.plain(axes)
         axes.legend(fontsize=8, frameon=False)
-    figure.suptitle(f"What view based sampling selects: {_about(result)}, eps = {epsilon}", fontsize=11)
+    figure.suptitle(f"Points selected by view-based sampling: {_about(result)}, eps = {epsilon}", fontsize=11)
     return figure

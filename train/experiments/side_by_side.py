@@ -1,4 +1,4 @@
-"""Trainings and measurements side by side: networks this small use one core each better than all cores together."""
+"""Trainings and measurements in parallel: networks this small use one core each better than all cores together."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.synchronize import Event
 from typing import Any
 
 import torch
@@ -31,14 +31,14 @@ def run_side_by_side(
 ) -> None:
     """Calls a function with each of several arguments, in processes with one thread each.
 
-    Ctrl-C and SIGTERM are passed on once to every process, where a training saves and ends; then KeyboardInterrupt is
-    raised. A call that fails lets those that are under way come to their end, and is raised then.
+    Ctrl-C and SIGTERM are passed on once to every process of this call, where a training saves and ends; then
+    KeyboardInterrupt is raised. If a call fails, those that run at the same time are finished before it is raised.
 
     Args:
         function: importable by name; it and its arguments are pickled.
         arguments: of every call.
         processes: at once, if there are as many calls.
-        title: of the bar: what is done, in the plural.
+        title: of the progress bar: what is done, in the plural.
         progress: show it.
 
     Raises:
@@ -46,15 +46,16 @@ def run_side_by_side(
     """
     processes = min(processes, len(arguments))
     context = multiprocessing.get_context("spawn")
+    ended = context.Event()
     waiting, running = deque(arguments), set[Future[object]]()
     failed: BaseException | None = None
     with (
         StopRequest() as stop,
-        ProcessPoolExecutor(processes, mp_context=context, initializer=_alone) as pool,
+        ProcessPoolExecutor(processes, context, initializer=_start_worker, initargs=(ended,)) as pool,
         tqdm(total=len(arguments), desc=title, unit=title.removesuffix("s"), disable=not progress) as bar,
     ):
         while running or (waiting and failed is None):
-            # No more than run at once are handed over: what waits in the pool could not be taken back.
+            # Only as many as run at once are handed over: what waits in the pool could not be taken back.
             while waiting and failed is None and len(running) < processes:
                 running.add(pool.submit(function, *waiting.popleft()))
             done, running = wait(running, timeout=0.5, return_when=FIRST_COMPLETED)
@@ -62,8 +63,7 @@ def run_side_by_side(
                 failed = failed or future.exception()
                 bar.update(failed is None)
             if stop.requested:
-                for child in multiprocessing.active_children():
-                    child.terminate()
+                ended.set()  # reaches the workers of this pool alone, not other children of the program
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise KeyboardInterrupt
     if isinstance(failed, BrokenProcessPool):
@@ -75,16 +75,16 @@ def run_side_by_side(
         raise failed
 
 
-def _alone() -> None:
-    """Prepares a worker: one thread, out of reach of the terminal's Ctrl-C, and not longer alive than its parent."""
+def _start_worker(ended: Event) -> None:
+    """Prepares a worker: one thread, not reached by the terminal's Ctrl-C, and ended with its parent."""
     if hasattr(os, "setsid"):  # not on Windows
         os.setsid()
     torch.set_num_threads(1)
     diffpoint.configure(threads=1)
-    threading.Thread(target=_watch, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=_watch, args=(os.getppid(), ended), daemon=True).start()
 
 
-def _watch(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1)
+def _watch(parent: int, ended: Event) -> None:
+    while not ended.wait(1) and os.getppid() == parent:
+        pass
     os.kill(os.getpid(), signal.SIGTERM)

@@ -6,7 +6,7 @@ import torch
 
 from models import Autoencoder, Predictor
 from train.data.batches import LoadedSplit
-from train.distributed import ALONE, World
+from train.distributed import SINGLE, World
 from train.evaluation.metrics import cloud_errors, in_silhouette, thin_out, visible_error
 
 METRICS = ("val_cd_1", "val_cd", "val_fps_cd", "val_visible", "val_inside")
@@ -14,7 +14,7 @@ _SHAPES_AT_ONCE = 8
 
 
 @torch.no_grad()
-def validate(model: Predictor, split: LoadedSplit, *, seed: int, world: World = ALONE) -> dict[str, float]:
+def validate(model: Predictor, split: LoadedSplit, *, seed: int, world: World = SINGLE) -> dict[str, float]:
     """Mean errors x100 over a split, with the same codes at every call, so that checkpoints differ by weights alone.
 
     Against the whole shape: `val_cd_1`, the prediction from one view; `val_cd`, that from all views (joined, read

@@ -1,1 +1,1 @@
-"""Front constraint or projection loss? A study on free clouds and in networks; start reading at study.py."""
+"""Front constraint against projection losses, on free point clouds and in networks. Start reading at experiment.py."""

@@ -1,4 +1,4 @@
-"""Free clouds: points without a network, moved down a loss between depth maps until they are the shape, or are not."""
+"""Free clouds: points without a network, moved by the gradient of a loss on depth maps."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ class Loss(NamedTuple):
 
     title: str
     value: Callable[[Tensor, Tensor | None, Scene, float], Tensor]
-    """Cloud (1, N, 3), logits of its points' existence, scene and progress in [0, 1] to a scalar."""
+    """(cloud (1, N, 3), occupancy logits of its points, scene, progress in [0, 1]) -> a scalar."""
     colour: str
     deletes: bool = False
-    """Whether it takes logits: it may delete points."""
+    """Whether it takes occupancy logits: it may remove points."""
 
 
 class Measures(NamedTuple):
-    """How good a cloud is, whatever loss made it."""
+    """Errors of a cloud, the same for every loss."""
 
     visible_cd: float
-    """Chamfer distance x100 between what the views see of the cloud and what they see of the shape."""
+    """Chamfer distance x100 between the visible part of the cloud and of the shape, over all views."""
     inside: float
     """Share of the points that project into the silhouette, over all views."""
     pred_to_gt: float
@@ -41,7 +41,7 @@ class Measures(NamedTuple):
     gt_to_pred: float
     """Mean distance x100 from the whole shape to the cloud."""
     left: float
-    """Share of the points that exist."""
+    """Share of the points that were not removed."""
 
 
 class Fit(NamedTuple):
@@ -53,7 +53,7 @@ class Fit(NamedTuple):
     largest_sideways: float
     """The largest |gradient in the first camera's x or y| of any point at any iteration."""
     losses: list[float]
-    """Its own loss at every iteration."""
+    """The loss at every iteration."""
     visible_cd: list[float]
     """`Measures.visible_cd` every `MEASURED_EVERY` iterations."""
     clouds: dict[int, Tensor]
@@ -91,11 +91,11 @@ LOSSES: dict[str, Loss] = {
 
 
 def fit_cloud(scene: Scene, loss: Loss, *, iterations: int, rate: float, kept: Sequence[int] = ()) -> Fit:
-    """Moves the start cloud by Adam down one loss, with a step size that falls from `rate` to 0 along a cosine.
+    """Minimises one loss by Adam from the start cloud, with a step size that falls from `rate` to 0 along a cosine.
 
     Args:
-        scene: what is seen of a shape.
-        loss: how the cloud is compared with it.
+        scene: the views of a shape.
+        loss: what is minimised.
         iterations: steps.
         rate: first step size, in world units (of logits, in theirs).
         kept: numbers of iterations after which copies of the cloud are kept.
@@ -148,7 +148,7 @@ def fit_cloud(scene: Scene, loss: Loss, *, iterations: int, rate: float, kept: S
 
 
 def _existing(cloud: Tensor, logits: Tensor | None) -> Tensor:
-    """(1, M, 3) the points that exist; all of them if none does."""
+    """(1, M, 3) the points that are not removed; all of them if none is left."""
     cloud = cloud.detach().clone()
     if logits is None or not bool((logits > 0).any()):
         return cloud
@@ -172,7 +172,7 @@ def measure(scene: Scene, cloud: Tensor) -> Measures:
 
 
 def _quietly(value: Callable[[], Tensor]) -> Tensor:
-    """Without the front constraint's warning that a view sees no point: here that is a result, not a mistake."""
+    """Without the front constraint's warning that a view sees no point: here that is a result."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="front_constraint: in ", category=RuntimeWarning)
         return value()

@@ -1,9 +1,8 @@
-"""The network under each loss: front constraint, projection losses, another visibility; everything else equal."""
+"""Networks trained with each loss: front constraint, projection losses, another visibility; everything else equal."""
 
 from __future__ import annotations
 
 import dataclasses
-import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -15,9 +14,11 @@ from models import Predictor
 from train.config import FitConfig, InferenceConfig, StageConfig, Supervision, fit_config_from_json
 from train.data.batches import Batch, LoadedSplit
 from train.evaluation.metrics import cloud_errors, in_silhouette, visible_error
-from train.evaluation.per_shape import ShapeMetrics, concatenate, one_view_each, sample_predictions
+from train.evaluation.per_shape import concatenate, one_view_each, sample_predictions
 from train.evaluation.runs import read_metrics
-from train.experiments.workbench import Workbench
+from train.experiments.statistics import spread
+from train.experiments.store import Metrics
+from train.experiments.study import Study
 from train.methods.systems import size_of
 from train.training.trainer import STAGES
 from train.training.validation import validate
@@ -25,8 +26,8 @@ from train.training.validation import validate
 Verdict = Literal["converged", "in between", "did not converge"]
 
 _STAGE1_SHARE, _STAGE2_SHARE, _MANY_SHARE = 0.25, 0.2, 0.35
-"""Of the profile's steps, with half of its shapes in a batch: enough to see what converges, little enough for all of
-them in an hour and a half."""
+"""Of the profile's steps, with half of its shapes in a batch: enough to see what converges, in an hour and a half for
+all trainings."""
 _VIEWS = 8
 _RANDOM = InferenceConfig(groups=1, steps=0)
 _PARTS = 32
@@ -34,8 +35,8 @@ _CURVES = ("visible", "inside", "cd_1", "cd")
 
 
 @dataclasses.dataclass(frozen=True)
-class Taught:
-    """A way to train.
+class Training:
+    """A loss to train with.
 
     Attributes:
         name: of the loss, as tables show it.
@@ -52,7 +53,7 @@ class Taught:
     def config(self, config: FitConfig, *, single: bool) -> FitConfig:
         """A profile's recipe under this loss.
 
-        The guard against networks that stop to look at their image is off: here that is a result.
+        The check for collapse is off: here a collapse is a result.
 
         Args:
             config: the profile's.
@@ -80,33 +81,33 @@ class Taught:
             }
         every = max(1, changes["stage2"].steps // 4)
         return dataclasses.replace(
-            config, **changes, min_image_sensitivity=0.0, validate_every=every, health_every=every,
+            config, **changes, min_image_sensitivity=0.0, validate_every=every, collapse_check_every=every,
             validation_shapes=min(16, config.validation_shapes),
         )  # fmt: skip
 
 
-TAUGHT: dict[str, Taught] = {
-    "front": Taught("front constraint", "#22577a", "front"),
-    "horizon": Taught("front constraint, hidden points dropped", "#57a0c9", "front", "horizon"),
-    "projection": Taught("projection loss, depth alone", "#c8553d", "projection"),
-    "lin": Taught("projection loss of Lin et al.", "#e59866", "lin"),
-    "soft": Taught("soft projection loss", "#6a994e", "soft"),
+TRAININGS: dict[str, Training] = {
+    "front": Training("front constraint", "#22577a", "front"),
+    "horizon": Training("front constraint, hidden points dropped", "#57a0c9", "front", "horizon"),
+    "projection": Training("projection loss, depth alone", "#c8553d", "projection"),
+    "lin": Training("projection loss of Lin et al.", "#e59866", "lin"),
+    "soft": Training("soft projection loss", "#6a994e", "soft"),
 }
 
 
-def configs(bench: Workbench) -> list[FitConfig]:
+def configs(study: Study) -> list[FitConfig]:
     """All trainings of the study, seed by seed."""
     return [
-        bench.config(lambda config, t=taught, s=single: t.config(config, single=s), seed=seed)
-        for seed in range(bench.seeds)
+        study.config(lambda config, t=training, s=single: t.config(config, single=s), seed=seed)
+        for seed in range(study.seeds)
         for single in (True, False)
-        for taught in TAUGHT.values()
-        if single or taught.visibility == "zbuffer"
+        for training in TRAININGS.values()
+        if single or training.visibility == "zbuffer"
     ]
 
 
-def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> ShapeMetrics:
-    """Figure -> (M,) of each shape's prediction from its first view in a seed's order, with one random code.
+def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> Metrics:
+    """Metrics (M,) of each shape's prediction from its first view in a seed's order, with one random code.
 
     "cd_1", "pred_to_gt", "gt_to_pred" x100 against the whole shape; "visible" and "inside" as in validation;
     "front_density": which share of the points lies where the view sees the surface, over the share of the true surface
@@ -115,35 +116,36 @@ def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> ShapeMetr
     """
     answered = sample_predictions(model, test, codes=1, seed=seed)
     return concatenate(
-        [beside_the_truth(made[0], test.points[shapes], shown) for shapes, shown, made in answered]
+        [single_view_metrics(made[0], test.points[shapes], shown) for shapes, shown, made in answered]
     )
 
 
-def beside_the_truth(clouds: Tensor, truth: Tensor, shown: Batch) -> ShapeMetrics:
-    """The figures of `single_views` of clouds (B, N, 3) beside true ones (B, P, 3), of which one view each is shown."""
-    errors = cloud_errors(clouds, truth)
+def single_view_metrics(clouds: Tensor, true: Tensor, shown: Batch) -> Metrics:
+    """The metrics of `single_views` of clouds (B, N, 3) against the ground true (B, P, 3), of which one view each is
+    shown."""
+    errors = cloud_errors(clouds, true)
     return {
         "visible": visible_error(clouds, shown.camera, shown.depth)[:, 0],
         "inside": in_silhouette(clouds, shown.camera, shown.depth).float().mean((1, 2)),
         "cd_1": errors.cd,
         "pred_to_gt": errors.pred_to_gt,
         "gt_to_pred": errors.gt_to_pred,
-        **densities(clouds, truth, visible_points(truth, shown.camera, method="horizon")[:, 0]),
+        **densities(clouds, true, visible_points(true, shown.camera, method="horizon")[:, 0]),
     }
 
 
-def densities(clouds: Tensor, truth: Tensor, seen: Tensor) -> ShapeMetrics:
+def densities(clouds: Tensor, true: Tensor, seen: Tensor) -> Metrics:
     """How evenly clouds (B, N, 3) lie on surfaces; see `single_views`.
 
     Args:
         clouds: (B, N, 3).
-        truth: (B, P, 3) evenly spread over the surface.
-        seen: (B, P) bool: does the view see this true point?
+        true: (B, P, 3) evenly spread over the surface.
+        seen: (B, P) bool: the points that the view sees.
     """
-    at = nearest(clouds, truth).index
+    at = nearest(clouds, true).index
     true_share, share = seen.float().mean(1), seen.gather(1, at).float().mean(1)
-    centres = torch.take_along_dim(truth, farthest_point_sample(truth, _PARTS)[..., None], 1)
-    part = nearest(truth, centres).index
+    centres = torch.take_along_dim(true, farthest_point_sample(true, _PARTS)[..., None], 1)
+    part = nearest(true, centres).index
     true_parts, parts = _histogram(part), _histogram(part.gather(1, at))
     return {
         "front_density": share / true_share.clamp(min=1e-6),
@@ -156,60 +158,62 @@ def _histogram(part: Tensor) -> Tensor:
     return torch.nn.functional.one_hot(part, _PARTS).float().mean(1)
 
 
-def study(bench: Workbench) -> dict[str, Any]:
-    """Trains and measures what is missing; what comes of it is for JSON.
+def summarise(study: Study) -> dict[str, Any]:
+    """Trains and measures what is missing; the result is for JSON.
 
     Returns:
-        "single" and "many": for each loss of `TAUGHT` means and spreads over trainings after each stage, and the curves
+        "single" and "many": for each of `TRAININGS` means and spreads over trainings after each stage, and the curves
         of validation with a verdict for each training.
     """
-    bench.train_all(configs(bench))
-    bench.measure_all(_measured, _networks(bench))
+    study.train_all(configs(study))
+    study.measure_all(_measured, _networks(study))
     return {
-        "shapes": len(bench.scores(configs(bench)[0], _RANDOM, views=_VIEWS)["cd"]),
-        "seeds": bench.seeds,
-        "profile": bench.profile,
-        "floor": _floor(bench),
-        "single": {name: _single(bench, taught) for name, taught in TAUGHT.items()},
+        "shapes": len(study.reconstruction_metrics(configs(study)[0], _RANDOM, views=_VIEWS)["cd"]),
+        "seeds": study.seeds,
+        "profile": study.profile,
+        "floor": _floor(study),
+        "single": {name: _single(study, training) for name, training in TRAININGS.items()},
         "many": {
-            name: _many(bench, taught) for name, taught in TAUGHT.items() if taught.visibility == "zbuffer"
+            name: _many(study, training)
+            for name, training in TRAININGS.items()
+            if training.visibility == "zbuffer"
         },
     }
 
 
 class Examples(NamedTuple):
-    """Held-out shapes, and what networks taught by each loss answer to one image of them after stage 1.
+    """Held-out shapes, and predictions for one image of them after stage 1 with each loss.
 
     Attributes:
         images: (M, 3, H, W) in [0, 1].
         camera: (M,) theirs.
-        truth: (M, P, 3).
-        clouds: name in `TAUGHT` -> (M, N, 3).
+        true: (M, P, 3).
+        clouds: name in `TRAININGS` -> (M, N, 3).
     """
 
     images: Tensor
     camera: PinholeCamera
-    truth: Tensor
+    true: Tensor
     clouds: dict[str, Tensor]
 
 
-def _networks(bench: Workbench) -> list[tuple[FitConfig, Literal[1, 2]]]:
+def _networks(study: Study) -> list[tuple[FitConfig, Literal[1, 2]]]:
     """Everything that is measured: every training, after each of its stages."""
     both: tuple[Literal[1, 2], ...] = (1, 2)
     return [
-        (config, stage) for config in configs(bench) for stage in (both if config.stage1.steps else both[1:])
+        (config, stage) for config in configs(study) for stage in (both if config.stage1.steps else both[1:])
     ]
 
 
 @torch.no_grad()
-def examples(bench: Workbench, *, count: int = 3) -> Examples:
-    """Of the first training of each loss; the shapes are spread over the test split."""
+def examples(study: Study, *, count: int = 3) -> Examples:
+    """Predictions of the first training with each loss; the shapes are spread over the test split."""
     clouds: dict[str, Tensor] = {}
-    for name, taught in TAUGHT.items():
-        config = bench.config(lambda c, t=taught: t.config(c, single=True), seed=0)
-        test = bench.split(config, "test")
+    for name, training in TRAININGS.items():
+        config = study.config(lambda c, t=training: t.config(c, single=True), seed=0)
+        test = study.split(config, "test")
         shapes = torch.linspace(0, len(test) - 1, min(count, len(test))).long()
-        model = bench.network(config, stage=1)
+        model = study.network(config, stage=1)
         seen = test.batch(shapes, torch.zeros(len(shapes), 1, dtype=torch.long))
         codes = torch.randn(1, len(shapes), model.code_dim, generator=torch.Generator().manual_seed(0))
         clouds[name] = model(seen.images[:, 0], codes)[0]
@@ -219,74 +223,67 @@ def examples(bench: Workbench, *, count: int = 3) -> Examples:
     return Examples(seen.images[:, 0], camera, test.points[shapes], clouds)
 
 
-def _floor(bench: Workbench) -> dict[str, float]:
-    """The figures of as many points of the true surface as a network predicts."""
-    config = configs(bench)[0]
-    test = bench.split(config, "test")
+def _floor(study: Study) -> dict[str, float]:
+    """The metrics of as many points of the true surface as a network predicts."""
+    config = configs(study)[0]
+    test = study.split(config, "test")
     count = size_of(config).points
     generator = torch.Generator().manual_seed(0)
     some = torch.stack([torch.randperm(test.points.shape[1], generator=generator)[:count] for _ in test.ids])
     found = [
-        beside_the_truth(test.clouds(shapes, some[shapes]), test.points[shapes], shown)
+        single_view_metrics(test.clouds(shapes, some[shapes]), test.points[shapes], shown)
         for shapes, shown in one_view_each(test, 0)
     ]
     return {name: values.mean().item() for name, values in concatenate(found).items()}
 
 
-def _single(bench: Workbench, taught: Taught) -> dict[str, Any]:
-    """A loss that began with single views: after stage 1 and after stage 2, curves, and whether it converged."""
-    runs = [bench.config(lambda c: taught.config(c, single=True), seed=seed) for seed in range(bench.seeds)]
+def _single(study: Study, training: Training) -> dict[str, Any]:
+    """Training that begins with single views: after stage 1 and after stage 2, curves, and whether it converged."""
+    runs = [study.config(lambda c: training.config(c, single=True), seed=seed) for seed in range(study.seeds)]
     return {
         "steps": [runs[0].stage1.steps, runs[0].stage2.steps],
-        "stage1": _spread([_measured(bench, config, 1) for config in runs]),
-        "stage2": _spread([_measured(bench, config, 2) for config in runs]),
-        "curves": [_curve(bench, config, 1) for config in runs],
+        "stage1": _over_seeds([_measured(study, config, 1) for config in runs]),
+        "stage2": _over_seeds([_measured(study, config, 2) for config in runs]),
+        "curves": [_curve(study, config, 1) for config in runs],
     }
 
 
-def _many(bench: Workbench, taught: Taught) -> dict[str, Any]:
-    """A loss that saw all views from the first step."""
-    runs = [bench.config(lambda c: taught.config(c, single=False), seed=seed) for seed in range(bench.seeds)]
+def _many(study: Study, training: Training) -> dict[str, Any]:
+    """Training with all views from the first step."""
+    runs = [
+        study.config(lambda c: training.config(c, single=False), seed=seed) for seed in range(study.seeds)
+    ]
     return {
         "steps": [runs[0].stage2.steps],
-        "stage2": _spread([_measured(bench, config, 2) for config in runs]),
-        "curves": [_curve(bench, config, 2) for config in runs],
+        "stage2": _over_seeds([_measured(study, config, 2) for config in runs]),
+        "curves": [_curve(study, config, 2) for config in runs],
     }
 
 
-def _measured(bench: Workbench, config: FitConfig, stage: Literal[1, 2]) -> dict[str, float]:
+def _measured(study: Study, config: FitConfig, stage: Literal[1, 2]) -> dict[str, float]:
     """Means over the test shapes: of single views, and of all views joined."""
-    alone = bench.measured(
+    alone = study.measure(
         config, "single views", lambda m, d: single_views(m, d, seed=config.seed), stage=stage
     )
-    joined = bench.scores(config, _RANDOM, stage=stage, views=_VIEWS)
-    both = {**alone, "cd": joined["cd"], "fps_cd": joined["fps_cd"]}
+    concatenate = study.reconstruction_metrics(config, _RANDOM, stage=stage, views=_VIEWS)
+    both = {**alone, "cd": concatenate["cd"], "fps_cd": concatenate["fps_cd"]}
     return {name: values.mean().item() for name, values in both.items()}
 
 
-def _spread(by_seed: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Mean, standard deviation over trainings (None for one), and each training's own."""
-    values = {name: [found[name] for found in by_seed] for name in by_seed[0]}
-    return {
-        name: {
-            "mean": statistics.fmean(v),
-            "sd": statistics.stdev(v) if len(v) > 1 else None,
-            "by_seed": v,
-        }
-        for name, v in values.items()
-    }
+def _over_seeds(by_seed: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    return {name: spread([found[name] for found in by_seed]) for name in by_seed[0]}
 
 
-def _curve(bench: Workbench, config: FitConfig, stage: Literal[1, 2]) -> dict[str, Any]:
-    """What validation said on the way, from the fresh weights on; and whether it converged."""
-    fresh = bench.measured(
+def _curve(study: Study, config: FitConfig, stage: Literal[1, 2]) -> dict[str, Any]:
+    """The validations during a training, from the fresh weights on; and whether it converged."""
+    fresh = study.measure(
         config,
         "validation",
         lambda m, d: {k: torch.tensor([v]) for k, v in validate(m, d, seed=config.seed).items()},
         stage=0,
         split="val",
     )
-    run = bench.train(config, stage=stage)
+    run = study.train(config, stage=stage)
     records = [r for r in read_metrics(run) if r["stage"] == stage and "val_visible" in r]
     trained = fit_config_from_json((run / "config.json").read_text(), where=str(run))
     before = sum(phase.steps for name, phase in trained.phases.items() if STAGES[name] < stage)

@@ -1,4 +1,4 @@
-"""What the trainings under each loss leave on paper: tables, curves, and what the networks predict."""
+"""Results on networks: tables, validation curves, and predictions."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from diffpoint import PinholeCamera
-from train.experiments.front_vs_projection.networks import TAUGHT, Examples
-from train.experiments.table import mean_and_spread, table_row, trainings
+from train.experiments.front_vs_projection.networks import TRAININGS, Examples
+from train.experiments.markdown import table_lines
+from train.experiments.statistics import spread_text, trainings
 from train.show import figures
 
 _FLOOR = "points of the true surface"
@@ -25,6 +26,7 @@ _SINGLE = {
     "cd": "8 views joined, CD",
     "fps_cd": "FPS-CD",
 }
+_EVENNESS = {"front_density": "density in front", "imbalance": "imbalance"}
 _PANELS = {
     "visible": "visible part, chamfer x100",
     "inside": "share inside the silhouette",
@@ -34,25 +36,23 @@ _PANELS = {
 
 def markdown(found: Mapping[str, Any]) -> str:
     """Tables of everything."""
-    single, many = found["single"], found["many"]
+    single, many, floor = found["single"], found["many"], found["floor"]
     stage1, stage2 = single["front"]["steps"]
+    evenness = [
+        [each.name, f"stage {stage}", *(spread_text(single[name][f"stage{stage}"][m]) for m in _EVENNESS)]
+        for name, each in TRAININGS.items()
+        for stage in (1, 2)
+    ]
+    evenness.append([_FLOOR, "", *(f"{floor[metric]:.2f}" for metric in _EVENNESS)])
     lines = [
         f"Networks of the profile `{found['profile']}`, {found['seeds']} trainings of each, {found['shapes']} held-out "
         "shapes, one random code for each image. Mean ± standard deviation over trainings; distances un-squared, x100.",
         "",
         f"Stage 1 on single views, {stage1} steps. Converged, by the last validation: the error of the visible part "
         "below 30 % of the fresh network's; not converged: above 80 %, or less than half of the points in the "
-        "silhouette. The last row is what as many points of the true surface have: nothing can be nearer.",
+        "silhouette. The last row is for as many points of the true surface, a lower bound.",
         "",
-        *_table(single, "stage1", verdicts=True),
-        table_row(
-            [
-                _FLOOR,
-                *(f"{found['floor'][figure]:.2f}" if figure in found["floor"] else "" for figure in _SINGLE),
-                "",
-                "",
-            ]
-        ),
+        *_table(single, "stage1", converged=True, floor=floor),
         "",
         f"The same networks after stage 2 on joined views, {stage2} more steps with the same loss:",
         "",
@@ -60,35 +60,30 @@ def markdown(found: Mapping[str, Any]) -> str:
         "",
         f"Joined views from the first step, no stage 1, {many['front']['steps'][0]} steps:",
         "",
-        *_table(many, "stage2", verdicts=True),
+        *_table(many, "stage2", converged=True),
         "",
-        "How evenly predictions of single views lie on the surface. Density in front: 1 is as dense as behind. "
+        "How evenly predictions for single views lie on the surface. Density in front: 1 is as dense as behind. "
         "Imbalance: share of the points that would have to move for 32 parts of the surface to be as dense.",
         "",
-        table_row(["loss", "after", "density in front", "imbalance"]),
-        table_row(["---", "---", "---:", "---:"]),
+        *table_lines(["loss", "after", *_EVENNESS.values()], evenness, "llrr"),
     ]
-    for name, taught in TAUGHT.items():
-        for stage in ("stage1", "stage2"):
-            cells = [
-                mean_and_spread(single[name][stage][figure]) for figure in ("front_density", "imbalance")
-            ]
-            lines.append(table_row([taught.name, stage.replace("stage", "stage "), *cells]))
-    floor = [f"{found['floor'][figure]:.2f}" for figure in ("front_density", "imbalance")]
-    lines.append(table_row([_FLOOR, "", *floor]))
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, ""])
 
 
-def _table(rows: Mapping[str, Any], stage: str, *, verdicts: bool = False) -> list[str]:
-    head = ["loss", *_SINGLE.values(), *(["error left", "converged?"] if verdicts else [])]
-    lines = [table_row(head), table_row(["---", *["---:"] * (len(head) - 1)])]
+def _table(
+    rows: Mapping[str, Any], stage: str, *, converged: bool = False, floor: Mapping[str, float] | None = None
+) -> list[str]:
+    head = ["loss", *_SINGLE.values(), *(["error left", "converged?"] if converged else [])]
+    lines = []
     for name, row in rows.items():
-        cells = [TAUGHT[name].name, *(mean_and_spread(row[stage][figure]) for figure in _SINGLE)]
-        if verdicts:
+        cells = [TRAININGS[name].name, *(spread_text(row[stage][metric]) for metric in _SINGLE)]
+        if converged:
             left = [curve["left"] for curve in row["curves"]]
             cells += [_between(left), _counted(curve["verdict"] for curve in row["curves"])]
-        lines.append(table_row(cells))
-    return lines
+        lines.append(cells)
+    if floor:
+        lines.append([_FLOOR, *(f"{floor[m]:.2f}" if m in floor else "" for m in _SINGLE), "", ""])
+    return table_lines(head, lines)
 
 
 def _between(shares: Sequence[float]) -> str:
@@ -104,10 +99,11 @@ def _counted(verdicts: Any) -> str:
 
 
 def curves(found: Mapping[str, Any]) -> Figure:
-    """What validation said on the way: a line for each loss, a band from the lowest to the highest training."""
+    """Validations during training: a line for each loss, a band from the lowest to the highest training."""
     figure = Figure(figsize=(14, 8), layout="constrained", dpi=110)
     figure.suptitle(
-        f"Networks under each loss: {trainings(found['seeds'])} of each; mean, lowest and highest, validation shapes",
+        f"Networks trained with each loss: {trainings(found['seeds'])} of each; mean, lowest and highest, validation "
+        "shapes",
         fontsize=14,
         fontweight="bold",
     )
@@ -116,7 +112,7 @@ def curves(found: Mapping[str, Any]) -> Figure:
     for line, (part, title) in zip(rows, titles.items(), strict=True):
         for axes, (name, label) in zip(line, _PANELS.items(), strict=True):
             for loss, row in found[part].items():
-                _draw_band(axes, row["curves"], name, TAUGHT[loss].colour, TAUGHT[loss].name)
+                _draw_band(axes, row["curves"], name, TRAININGS[loss].colour, TRAININGS[loss].name)
             axes.axhline(found["floor"][name], color=figures.MUTED, lw=1, ls="--", label=_FLOOR)
             if name != "inside":  # one that runs away would press the others flat
                 start = max(training[name][0] for row in found[part].values() for training in row["curves"])
@@ -139,9 +135,9 @@ def _draw_band(
 
 
 def predictions(found: Examples) -> Figure:
-    """What each loss taught a network to answer to single views, from the image's side and a quarter turn away."""
-    images, camera, truth, clouds = found
-    columns = {"the shape itself": truth} | {TAUGHT[name].name: made for name, made in clouds.items()}
+    """Predictions for single views after training with each loss, from the image's side and a quarter turn away."""
+    images, camera, true, clouds = found
+    columns = {"ground truth": true} | {TRAININGS[name].name: made for name, made in clouds.items()}
     figure = Figure(
         figsize=(1.9 * (len(columns) + 1), 3.6 * len(images) + 0.9), layout="constrained", dpi=110
     )

@@ -1,14 +1,14 @@
-"""What the study of free clouds leaves on paper: a summary, Markdown tables, figures and an animation."""
+"""Results on free clouds: a summary, Markdown tables, figures and an animation."""
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,6 +18,7 @@ from torch import Tensor
 from train.evaluation.metrics import in_silhouette
 from train.experiments.front_vs_projection.free_clouds import LOSSES, MEASURED_EVERY, Fit, fit_cloud
 from train.experiments.front_vs_projection.shapes import Cameras, Scene, StudyShape
+from train.experiments.markdown import table_lines
 from train.files import replacing
 from train.show import figures
 
@@ -35,100 +36,95 @@ DRAWN = ("projection", "lin", "soft", "front")
 
 
 def summarise(
-    results: Sequence[Mapping[str, Any]],
+    fits: Sequence[Mapping[str, Any]],
     shapes: Sequence[StudyShape],
     *,
     iterations: int,
     rates: Mapping[str, float],
     seeds: int,
 ) -> dict[str, Any]:
-    """Means and standard deviations over shapes and seeds, by cameras and loss; and the claims for one view."""
+    """Means and standard deviations over shapes and seeds, by cameras and loss; and the comparison for one view."""
     table: dict[str, dict[str, Any]] = {}
-    for result in results:
-        table.setdefault(result["cameras"], {}).setdefault(result["loss"], []).append(result)
+    values: Any = pd.DataFrame(fits)
+    for (cameras, loss), cells in values.groupby(["cameras", "loss"], sort=False):
+        columns = cells[[*MEASURES, "left"]]
+        table.setdefault(str(cameras), {})[str(loss)] = {
+            "fits": len(cells),
+            **pd.DataFrame({"mean": columns.mean(), "sd": columns.std(ddof=0)}).to_dict("index"),
+            "visible_cd_on_the_way": np.mean(cells["visible_cd_on_the_way"].tolist(), 0).round(4).tolist(),
+        }
     return {
         "iterations": iterations,
         "seeds": seeds,
         "rates": dict(rates),
         "shapes": {shape.name: shape.source for shape in shapes},
-        "table": {
-            cameras: {loss: _spread(cells) for loss, cells in by_loss.items()}
-            for cameras, by_loss in table.items()
-        },
-        "one_view": _one_view(table.get(ONE.name, {})),
-        "fits": list(results),
+        "table": table,
+        "one_view": _one_view(values[values["cameras"] == ONE.name]),
+        "fits": list(fits),
     }
 
 
-def _spread(cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    columns = {name: [cell[name] for cell in cells] for name in (*MEASURES, "left")}
-    curves = np.mean([cell["visible_cd_on_the_way"] for cell in cells], axis=0)
-    return {
-        "fits": len(cells),
-        **{name: {"mean": statistics.fmean(v), "sd": statistics.pstdev(v)} for name, v in columns.items()},
-        "visible_cd_on_the_way": curves.round(4).tolist(),
-    }
-
-
-def _one_view(by_loss: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
-    """For every loss: how many times the front constraint's visible error it leaves, and its sideways gradient."""
-    front = {(cell["shape"], cell["seed"]): cell["visible_cd"] for cell in by_loss.get("front", ())}
-    claims: dict[str, Any] = {}
-    for loss, cells in by_loss.items():
-        times: dict[str, list[float]] = {}
-        for cell in cells:
-            times.setdefault(cell["shape"], []).append(
-                cell["visible_cd"] / front[cell["shape"], cell["seed"]]
-            )
-        claims[loss] = {
-            "times_front": {shape: {"least": min(t), "most": max(t)} for shape, t in times.items()},
-            "largest_sideways_gradient": max(cell["largest_sideways"] for cell in cells),
+def _one_view(fits: Any) -> dict[str, Any]:
+    """For every loss: its error of the visible part over that of the front constraint, and its sideways gradient."""
+    front = fits[fits["loss"] == "front"].set_index(["shape", "seed"])["visible_cd"].rename("front_cd")
+    fits = fits.join(front, on=["shape", "seed"])
+    fits["ratio"] = fits["visible_cd"] / fits["front_cd"]
+    found: dict[str, Any] = {}
+    for loss, cells in fits.groupby("loss", sort=False):
+        ratios = cells.groupby("shape", sort=False)["ratio"].agg(["min", "max"])
+        ratios.columns = ["least", "most"]
+        found[str(loss)] = {
+            "times_front": ratios.to_dict("index"),
+            "largest_sideways_gradient": cells["largest_sideways"].max().item(),
         }
-    return claims
+    return found
 
 
 def markdown(found: Mapping[str, Any]) -> str:
     """Tables of everything."""
     names = ", ".join(f"{shape} ({source})" for shape, source in found["shapes"].items())
     seeds, shapes = _counted(found["seeds"], "seed"), _counted(len(found["shapes"]), "shape")
+    rates = ", ".join(f"{LOSSES[loss].title} {rate:g}" for loss, rate in found["rates"].items())
+    rows = [
+        [
+            cameras,
+            LOSSES[loss].title,
+            *(_value(name, cell[name]) for name in MEASURES),
+            f"{cell['left']['mean']:.0%}",
+        ]
+        for cameras, by_loss in found["table"].items()
+        for loss, cell in by_loss.items()
+    ]
+    head = ["cameras", "loss", *MEASURES.values(), "points left"]
     lines = [
         f"Free clouds of 1024 points, {found['iterations']} steps of Adam, {seeds} (start and turn of the cameras) of "
         f"each of {shapes}: {names}. Mean ± standard deviation over shapes and seeds; distances are un-squared, "
         "x100, of shapes about 1 across.",
         "",
-        "First step sizes, the best of three for each loss on another shape: "
-        + ", ".join(f"{LOSSES[loss].title} {rate:g}" for loss, rate in found["rates"].items())
-        + ".",
+        f"First step sizes, the best of three for each loss on another shape: {rates}.",
         "",
-        "| cameras | loss | " + " | ".join(MEASURES.values()) + " | points left |",
-        "|---|---|" + "---:|" * (len(MEASURES) + 1),
+        *table_lines(head, rows, "ll" + "r" * (len(head) - 2)),
     ]
-    for cameras, by_loss in found["table"].items():
-        for loss, cell in by_loss.items():
-            values = [_value(name, cell[name]) for name in MEASURES]
-            lines.append(
-                f"| {cameras} | {LOSSES[loss].title} | {' | '.join(values)} | {cell['left']['mean']:.0%} |"
-            )
     if "front" in found["one_view"]:
+        shape_names = list(found["shapes"])
+        rows = []
+        for loss, each in found["one_view"].items():
+            if loss == "front":
+                continue
+            ratios, largest = each["times_front"], each["largest_sideways_gradient"]
+            cells = [
+                f"{ratios[s]['least']:.1f} to {ratios[s]['most']:.1f}" if s in ratios else ""
+                for s in shape_names
+            ]
+            rows.append([LOSSES[loss].title, *cells, "0 exactly" if largest == 0 else f"{largest:.2g}"])
         lines += [
             "",
-            "One view: how many times the front constraint's error of the visible part a loss leaves, least to most "
-            "over the seeds; and the largest gradient in the camera's x or y that any point had at any step.",
+            "One view: error of the visible part, as a multiple of the front constraint's, smallest to largest over "
+            "the seeds; and the largest gradient in the camera's x or y of any point at any step.",
             "",
-            f"| loss | {' | '.join(found['shapes'])} | largest gradient in x, y |",
-            "|---|" + "---:|" * (len(found["shapes"]) + 1),
+            *table_lines(["loss", *shape_names, "largest gradient in x, y"], rows),
         ]
-        for loss, claim in found["one_view"].items():
-            if loss != "front":
-                times = claim["times_front"]
-                cells = [
-                    f"{times[s]['least']:.1f} to {times[s]['most']:.1f}" if s in times else ""
-                    for s in found["shapes"]
-                ]
-                largest = claim["largest_sideways_gradient"]
-                last = "0 exactly" if largest == 0 else f"{largest:.2g}"
-                lines.append(f"| {LOSSES[loss].title} | {' | '.join(cells)} | {last} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, ""])
 
 
 def _value(name: str, cell: Mapping[str, float]) -> str:
@@ -138,11 +134,11 @@ def _value(name: str, cell: Mapping[str, float]) -> str:
 
 def draw(
     found: Mapping[str, Any], shape: StudyShape, out: Path, *, iterations: int, rates: Mapping[str, float]
-) -> None:
-    """The curves of all fits; the clouds of one shape as a figure, and moving, if one view is in the study."""
-    figures.save(curves(found), out / "front-vs-projection.png")
+) -> dict[str, Figure]:
+    """The curves of all fits; with one view also the clouds of one shape, and an animation of them in `out`."""
+    drawn = {"": curves(found)}
     if ONE.name not in found["table"]:
-        return
+        return drawn
     kept = range(0, iterations + 1, max(1, iterations // 40))
     scenes = {c: shape.scene(c, seed=0) for c in (ONE, MANY) if c.name in found["table"]}
     fits = {
@@ -151,10 +147,10 @@ def draw(
         if scene is not None
         for loss in DRAWN
     }
-    drawn = {cameras: scene for cameras, scene in scenes.items() if scene is not None}
-    figures.save(clouds(drawn, fits, shape.name), out / "front-vs-projection-clouds.png")
+    seen = {cameras: scene for cameras, scene in scenes.items() if scene is not None}
     one = {loss: fit for (cameras, loss), fit in fits.items() if cameras == ONE}
-    animate(drawn[ONE], one, out / "front-vs-projection-clouds.gif")
+    animate(seen[ONE], one, out / "front-vs-projection-clouds.gif")
+    return drawn | {"-clouds": clouds(seen, fits, shape.name)}
 
 
 def curves(found: Mapping[str, Any]) -> Figure:
@@ -209,7 +205,7 @@ def _short(cameras: str) -> str:
 
 
 def clouds(scenes: Mapping[Cameras, Scene], fits: Mapping[tuple[Cameras, str], Fit], shape: str) -> Figure:
-    """A row for each loss: the cloud on its way under one view, and its end under many."""
+    """A row for each loss: the cloud during the fit to one view, and after the fit to many."""
     one = scenes[ONE]
     steps = sorted(fits[ONE, DRAWN[0]].clouds)
     shown = [steps[round(share * (len(steps) - 1))] for share in (0, 0.1, 0.3, 1)]

@@ -1,4 +1,5 @@
-"""Shapes to study losses on: embedded ones and meshes from any camera, the shapes of a data tree from their own.
+"""Shapes for the comparison of losses: procedural ones and meshes seen from any camera, those of a data tree from
+theirs.
 
 The frame of a scene is that of its first camera, in which the x and y of a gradient are that camera's to the last bit.
 """
@@ -38,7 +39,7 @@ _GOLDEN_DEG = 180 * (3 - 5**0.5)
 
 
 class Cameras(NamedTuple):
-    """Where the views of a scene stand."""
+    """The cameras of a scene."""
 
     count: int
     sphere: bool = False
@@ -60,7 +61,7 @@ class Cameras(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What a fit is given, and what it is judged by; all in the frame of the first camera."""
+    """The input of a fit, and the ground truth for its errors; all in the frame of the first camera."""
 
     camera: PinholeCamera
     """V views."""
@@ -74,7 +75,7 @@ class Scene(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class StudyShape:
-    """A shape that can be seen from `cameras`.
+    """A shape that can be seen from several `Cameras`.
 
     Attributes:
         name: unique in a study, and safe as a file's name.
@@ -90,7 +91,7 @@ class StudyShape:
     surface: Tensor
 
     def scene(self, cameras: Cameras, *, seed: int, points: int = 1024) -> Scene | None:
-        """The views, turned at random, and a random cloud to start from; None where there are no such views."""
+        """The views, turned at random, and a random cloud to start from; None if the shape has no such views."""
         random = np.random.default_rng(seed)
         seen = self.see(cameras, float(random.uniform(0, 360)))
         if seen is None:

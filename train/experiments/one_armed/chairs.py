@@ -1,7 +1,7 @@
-"""Chairs of the embedded family from which one arm was taken, and two views of each: only the second one tells.
+"""Procedural chairs with one arm removed, and two views of each: only the second shows that it is missing.
 
-A chair is drawn with two arms and loses one; what is left is a chair as the family draws it with one arm. View A shows
-the arm that stays, with the other one's place hidden behind it or behind the back; view B is from the front, on the
+A chair is drawn with two arms and one is removed; the rest is a chair as the family draws it with one arm. View A shows
+the arm that stays, with the place of the other hidden behind it or behind the back; view B is from the front, on the
 other side. (Of the family's chairs that have an arm on one side, seven in ten have the other arm too.)
 """
 
@@ -25,15 +25,15 @@ Side = Literal[-1, 1]
 Arms = Literal["one", "both", "none"]
 
 SEED = 20_190_616
-"""First word of these chairs' seeds. Trees are made with `--seed`, which is 0, 1, ...: none holds one of them."""
+"""First number of these chairs' seeds. Trees are made with `--seed`, which is 0, 1, ...: none holds one of them."""
 HIDDEN, SHOWN = 0.001, 0.03
 """Share of the object's pixels that change when an arm is taken away: at most, where it counts as hidden, and at least,
 where it counts as shown."""
 LEAST_SHARE = 0.02
-"""An arm has at least this share of the chair's points in its box, or nobody could count it in 512 points."""
+"""An arm has at least this share of the chair's points in its box: with less, 512 points are too few to measure it."""
 _MARGIN, _GAP, _INWARD = 0.05, 0.02, 0.6  # world units, and a share: see `arm_box`
 RULES = (HIDDEN, SHOWN, LEAST_SHARE, _MARGIN, _GAP, _INWARD)
-"""What decides which chairs these are, and where their arms are counted."""
+"""All constants that decide which chairs these are, and where their arms are counted."""
 _RISE = 0.05  # world units above the seat: less than any arm, more than what else stands beside the middle
 _A_DEG = range(60, 141, 10), (-15, -5, 5, 15, 25)  # azimuths and elevations that A and B are chosen from
 _B_DEG = range(30, 61, 10), (15, 25)
@@ -134,10 +134,10 @@ def without(solids: Sequence[Solid], left_out: Sequence[Solid]) -> list[Solid]:
 
 
 def arm_box(arm: Sequence[Solid], rest: Sequence[Solid]) -> np.ndarray:
-    """(2, 3) lowest and highest corner of the room in which points count for an arm.
+    """(2, 3) lowest and highest corner of the box in which points count for an arm.
 
-    It is the arm's bounding box with a margin of 0.05 for points that are a little off. Towards the middle it reaches
-    farther, to 0.6 of the arm's distance, as a chair is often drawn too narrow. It ends 0.02 above seat and cushion
+    It is the arm's bounding box with a margin of 0.05 for inaccurate points. Towards the middle it reaches farther, to
+    0.6 of the arm's distance, because predicted chairs are often too narrow. It ends 0.02 above seat and cushion
     and 0.02 in front of the back: a chair without this arm has nothing there.
 
     Args:
@@ -167,7 +167,7 @@ def _find_views(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Azimuths, elevations and changed shares of A and B, each (2,); None if nothing hides the arm and shows the other.
 
-    Of the views that would do for A, the one that is farthest from the side, from where the width cannot be seen.
+    Of the views that are suitable as A, the one farthest from the side, from where the width cannot be seen.
     """
     from_side, from_front = (
         np.array(list(itertools.product(azimuths, elevations))).T * ((where,), (1,))

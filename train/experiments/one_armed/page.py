@@ -1,4 +1,4 @@
-"""The words and the picture of the experiment on chairs with one arm."""
+"""The page and the figure of the experiment on chairs with one arm."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, project
 from train.data.render import orbit_camera
-from train.evaluation.per_shape import ShapeMetrics
+from train.experiments.markdown import table_lines
 from train.experiments.one_armed.chairs import SEED, make_chair
-from train.experiments.table import claim_lines, mean_and_spread, table_lines, trainings
+from train.experiments.statistics import claim_lines, spread_text, trainings
+from train.experiments.store import Metrics
 from train.show import figures
 
 ROWS = PLAIN, _, PSGN, _, CODED, TWO, TRUTH = (
@@ -35,64 +36,62 @@ COLUMNS = {
     "none": "and if it has none",
 }
 DRAWN = 0.5
-"""From this share of a real arm's points on, an arm counts as drawn."""
-_ALARM = "#d1352b"
+"""An arm counts as predicted from this share of the points of a real arm."""
+_RED = "#d1352b"
 
 
-def page(result: Mapping[str, Any]) -> str:
+def markdown(result: Mapping[str, Any]) -> str:
     """What was measured, in words and tables."""
     codes, changed = result["codes"], result["changed"]
     head = (
-        f"{result['chairs']} chairs of the embedded family that no tree holds, with one arm; profile "
+        f"{result['chairs']} procedural chairs with one arm, which are in no data tree; profile "
         f"`{result['profile']}`, {trainings(result['seeds'])} of each. View A hides whether there is another arm (that "
         f"would change {changed['A']:.1%} of the chair's pixels, median), view B shows that there is none "
         f"({changed['B']:.1%}). Points in the box of an arm, as a share of those of a real arm: 0 is no arm, 1 a whole "
         "one; mean ± standard deviation over trainings."
     )
-    rows = [
-        [name, *(mean_and_spread(row[column]) for column in COLUMNS)] for name, row in result["rows"].items()
-    ]
+    rows = [[name, *(spread_text(row[column]) for column in COLUMNS)] for name, row in result["rows"].items()]
     single = (
-        f"Of {codes['number']} random codes for view A, the one that draws least of the missing arm draws "
-        f"{codes['least']:.2f} of it, the one that draws most {codes['most']:.2f} (means over chairs); "
-        f"{codes['draw_it']:.0%} of the codes draw more than half of it."
+        f"Of {codes['number']} random codes for view A, the one with the fewest points of the missing arm predicts "
+        f"{codes['least']:.2f} of it, the one with the most {codes['most']:.2f} (means over chairs); "
+        f"{codes['draw_it']:.0%} of the codes predict more than half of it."
     )
-    sure = "Who draws no arms draws no missing ones either; the last two claims ask for more than that."
+    last = "A network that predicts no arms predicts no missing ones either; the last two claims exclude that case."
     lines = [head, "", *table_lines(["", *COLUMNS.values()], rows)]
-    for paragraph in (single, _caution(result["rows"]), sure):
+    for paragraph in (single, _weak_networks(result["rows"]), last):
         lines += ["", paragraph]
     return "\n".join([*lines, "", *claim_lines(result["claims"]), ""])
 
 
-def _caution(rows: Mapping[str, Any]) -> str:
-    """Can these networks draw arms at all?"""
+def _weak_networks(rows: Mapping[str, Any]) -> str:
+    """Can these networks predict arms at all?"""
     weak = [name for name, row in rows.items() if row["present"]["mean"] - row["none"]["mean"] < DRAWN]
     if not weak:
-        return "All of them draw the arm that is there: what is not drawn of the other one counts."
+        return "All of them predict the arm that is there, so that a missing arm that is not predicted is a result."
     words = "; ".join(
         f"{name} {rows[name]['present']['mean']:.2f} and {rows[name]['none']['mean']:.2f}" for name in weak
     )
     return (
-        "Networks that hardly draw arms say little of missing ones. Between an arm that is there and the place of one "
-        f"on a chair without arms, these differ by less than half an arm: {words}."
+        "Networks that hardly predict arms show little about missing ones. For these, an arm that is there and the "
+        f"same place on a chair without arms differ by less than half an arm: {words}."
     )
 
 
 def figure(
     result: Mapping[str, Any],
     size: int,
-    known: ShapeMetrics,
+    chairs: Metrics,
     clouds: Mapping[str, Tensor],
-    drawn: ShapeMetrics,
+    shares: Mapping[str, np.ndarray],
 ) -> Figure:
-    """The first chairs with what the first training makes of them, seen from above the missing arm.
+    """The first chairs with the predictions of the first training, seen from above the missing arm.
 
     Args:
         result: what one-armed.json holds.
         size: of the pictures, pixels.
-        known: of the chairs.
+        chairs: as `measure` keeps them.
         clouds: row -> (few, N, 3), one of each chair that is shown.
-        drawn: row -> (S, M, K, 4), of all of them.
+        shares: row -> (S, M, K, 4), of all of them.
     """
     columns = {
         PLAIN: "deterministic, A",
@@ -104,38 +103,37 @@ def figure(
     shown = range(len(clouds[TRUTH]))
     drawing, panels = figures.grid(rows=len(shown), columns=2 + len(columns))
     for number, line in zip(shown, panels, strict=True):
-        side = int(known["side"][number])
-        chair = make_chair((SEED, int(known["number"][number])), 1 if side > 0 else -1)
+        side = int(chairs["side"][number])
+        chair = make_chair((SEED, int(chairs["number"][number])), 1 if side > 0 else -1)
         assert chair is not None
         for axes, image in zip(line, chair.images(size), strict=False):
             figures.draw_image(axes, torch.from_numpy(image).permute(2, 0, 1).float() / 255)
         eye = orbit_camera(np.array([-20.0 * side]), np.array([35.0]), 128).to(dtype=torch.float32)
-        boxes = known["boxes"][number].float()
-        everything = torch.cat([known["one, truth"][number], boxes.flatten(0, 1)])
-        close = figures.narrowed(eye, everything)
+        boxes = chairs["boxes"][number].float()
+        close = figures.narrowed(eye, torch.cat([chairs["one, truth"][number], boxes.flatten(0, 1)]))
         for axes, name in zip(line[2:], columns, strict=True):
             cloud = clouds[name][number]
             colours = figures.TRUE if name == TRUTH else figures.PREDICTED
             figures.draw_cloud(axes, cloud, close[0], colours=colours)
             _mark(axes, cloud, boxes[0], close[0])
-            missing, present = drawn[name][0, number, 0, :2].tolist()
+            missing, present = shares[name][0, number, 0, :2].tolist()
             figures.caption(axes, f"missing arm {missing:.2f}, present {present:.2f}")
     figures.titles(panels, ["view A", "view B", *columns.values()])
     figures.headline(
         drawing,
         f"Chairs with one arm, profile {result['profile']}, seed 0; red: where the other arm would be; "
-        "points there and at the arm that is there, as shares of a real arm's",
+        "points there and at the present arm, as shares of a real arm's",
     )
     return drawing
 
 
 def _mark(axes: Axes, cloud: Tensor, box: Tensor, camera: PinholeCamera) -> None:
-    """Outlines a box (2, 3), and rings the points (N, 3) in it."""
+    """Outlines a box (2, 3), and circles the points (N, 3) in it."""
     corners = torch.cartesian_prod(*box.T)
     pixels = project(corners[None], camera).pixels[0, 0]
     for start, end in itertools.combinations(range(8), 2):
         if int((corners[start] != corners[end]).sum()) == 1:  # they share an edge
-            axes.plot(*pixels[[start, end]].T, color=_ALARM, lw=0.6, alpha=0.6)
+            axes.plot(*pixels[[start, end]].T, color=_RED, lw=0.6, alpha=0.6)
     points = cloud[((cloud > box[0]) & (cloud < box[1])).all(-1)]
     if len(points):
-        axes.scatter(*project(points[None], camera).pixels[0, 0].T, s=14, color=_ALARM, linewidths=0)
+        axes.scatter(*project(points[None], camera).pixels[0, 0].T, s=14, color=_RED, linewidths=0)

@@ -1,0 +1,85 @@
+"""What an experiment is: trainings that it needs, and what is made of them: numbers, a page, figures."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
+
+from train.config import FitConfig
+from train.experiments import store
+from train.experiments.study import Study
+from train.files import write_text
+from train.show import figures
+
+
+class Outcome(NamedTuple):
+    """What an experiment found.
+
+    Attributes:
+        result: for NAME.json; "claims", if there are any, are those of `statistics.claim`.
+        page: for NAME.md.
+        figures: ending of the file's name ("" or "-something") -> for NAME.png or NAME-something.png.
+    """
+
+    result: dict[str, Any]
+    page: str
+    figures: Mapping[str, Figure]
+
+
+def _none(study: Study) -> list[Any]:
+    return []
+
+
+class Experiment(NamedTuple):
+    """An experiment.
+
+    Attributes:
+        make: trains and measures what is missing.
+        trainings: all configurations that it needs.
+        other_inputs: what else decides the outcome: words, and files that are read.
+        own_trainings: of its trainings those that are not runs of `fit`, by the file that each leaves.
+    """
+
+    make: Callable[[Study], Outcome]
+    trainings: Callable[[Study], list[FitConfig]] = _none
+    other_inputs: Callable[[Study], Iterable[str | Path]] = _none
+    own_trainings: Callable[[Study], dict[Path, FitConfig]] = lambda study: {}
+
+
+def make_experiment(name: str, experiment: Experiment, study: Study) -> dict[str, Any]:
+    """Makes an experiment and writes NAME.json, NAME.md and its figures into `study.out`; returns what NAME.json
+    holds."""
+    outcome = experiment.make(study)
+    result = outcome.result | {"made_from": made_from(experiment, study)}
+    for ending, figure in outcome.figures.items():
+        figures.save(figure, study.out / f"{name}{ending}.png")
+    write_text(study.out / f"{name}.md", outcome.page)
+    write_text(study.out / f"{name}.json", json.dumps(result, indent=2) + "\n")
+    return result
+
+
+def is_done(name: str, experiment: Experiment, study: Study) -> bool:
+    """Is an experiment's result there, of just these trainings, data, seeds and limits?"""
+    paths = [study.out / f"{name}.{kind}" for kind in ("json", "md", "png")]
+    if not all(path.exists() for path in paths):
+        return False
+    return json.loads(paths[0].read_text()).get("made_from") == made_from(experiment, study)
+
+
+def made_from(experiment: Experiment, study: Study) -> dict[str, Any]:
+    """All that an outcome depends on; `study.category` shows in the trainings."""
+    trees = study.on_trees()
+    inputs: list[object] = [str(root) for root in study.data if root not in trees.data]
+    for item in experiment.other_inputs(study):
+        inputs.append(hashlib.sha256(item.read_bytes()).hexdigest() if isinstance(item, Path) else item)
+    if trees.data:  # some experiments need none
+        inputs += trees.fingerprints()
+        configs = [*experiment.trainings(trees), *experiment.own_trainings(trees).values()]
+        inputs += sorted({trees.run_of(config).name for config in configs})
+    settings = {name: getattr(study, name) for name in ("profile", "seeds", "limit", "steps")}
+    return {"inputs": store.digest(inputs), **settings}

@@ -1,0 +1,421 @@
+"""Trainings and measurements that experiments share: each is made once, and found again by all that it depends on.
+
+    OUT/runs/KEY-seed0/    a run of `fit`; KEY is the digest of its whole configuration, the data's fingerprint and
+                           `TRAINING_VERSION`. `trained.json` marks a finished one. Stage 1 and stage 2 are runs of
+                           their own, so that trainings share a stage 1
+    OUT/metrics...         per-shape metrics, see store.py
+
+An experiment that was stopped continues when it is called again: `fit` resumes, finished measurements are read.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from models import Predictor
+from train.config import PROFILES, FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
+from train.data.batches import LoadedSplit
+from train.errors import UserError
+from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate, evaluate_split
+from train.evaluation.retrieval import medoid, nearest_by_image
+from train.evaluation.runs import best_weights, load_predictor, read_split
+from train.experiments import store
+from train.experiments.side_by_side import run_side_by_side
+from train.experiments.store import Metrics, NotMeasured
+from train.files import write_text
+from train.methods.recipes import with_system
+from train.methods.systems import build_network, cloud_size, image_size
+from train.training import TRAINING_VERSION
+from train.training.trainer import fit
+
+Split = Literal["train", "val", "test"]
+Change = Callable[[FitConfig], FitConfig]
+"""How the configuration of a variant differs from that of its profile."""
+
+# Fields that do not change the weights. The seed has a place of its own in the name of a run.
+_NOT_OF_THE_WEIGHTS = (
+    "inference",
+    "seed",
+    "log_every",
+    "picture_every",
+    "checkpoint_every",
+    "keep_checkpoints",
+)
+# The error of a method on its training shapes is measured on so many of them.
+_SOME_TRAINING_SHAPES = 100
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """Data, a profile and seeds; and a directory for what is trained and measured with them.
+
+    Attributes:
+        data: roots of data trees, put together for training; the test split of the first is used for measurements.
+        out: directory for runs, metrics and results.
+        profile: size of the networks and recipe of their training.
+        seeds: number of trainings of each variant, with seeds 0, 1, ...
+        limit: measure at most that many test shapes.
+        steps: if given, the same number of steps for every phase, for a quick look.
+        progress: show progress bars.
+        processes: how many trainings or measurements run at the same time, each in a process with one thread.
+        category: for single-category, the category that it is about.
+        pictures: for photos, a folder with a folder of photographs for each object.
+        run: for agreement, a trained run, as `train.evaluation.runs.open_run` takes it; trained here if not given.
+        views: for agreement, views per shape.
+        measures: False: `NotMeasured` is raised instead of measuring anything.
+    """
+
+    data: tuple[Path, ...]
+    out: Path
+    profile: Profile = "cpu"
+    seeds: int = 3
+    limit: int | None = None
+    steps: int | None = None
+    progress: bool = True
+    processes: int = 1
+    category: str = "chair"
+    pictures: Path | None = None
+    run: Path | None = None
+    views: int = 8
+    measures: bool = True
+    _splits: dict[tuple, LoadedSplit] = dataclasses.field(default_factory=dict, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1:
+            raise UserError(f"--seeds must be at least 1; got {self.seeds}")
+        if self.limit is not None and self.limit < 2:
+            raise UserError(f"--limit must be at least 2, for a spread over shapes; got {self.limit}")
+        if self.processes < 1:
+            raise UserError(f"--processes must be at least 1; got {self.processes}")
+
+    # Configurations and data
+
+    def config(self, change: Change, *, seed: int) -> FitConfig:
+        """The profile's configuration with the changes of a variant."""
+        config = dataclasses.replace(change(PROFILES[self.profile]), seed=seed, picture_every=0)
+        return config if self.steps is None else with_steps(config, self.steps)
+
+    def configs(self, *changes: Change) -> list[FitConfig]:
+        """The configurations of variants with every seed, seed by seed."""
+        return [self.config(change, seed=seed) for seed in range(self.seeds) for change in changes]
+
+    def on_trees(self) -> Study:
+        """The same with only those of its data that are data trees, on which networks can be trained."""
+        return dataclasses.replace(
+            self, data=tuple(root for root in self.data if (root / "data_list").is_dir())
+        )
+
+    def need_data(self) -> None:
+        """Raises a UserError if there are no data."""
+        if not self.data:
+            raise UserError("no data; name one or more data trees with --data")
+
+    @property
+    def test_tree(self) -> Path:
+        """The first data tree, whose test shapes are measured."""
+        self.need_data()
+        return self.data[0]
+
+    def fingerprints(self) -> list[str]:
+        """Of each data tree: changes when its lists, or what it was made with, change."""
+        self.need_data()
+        return [_tree_fingerprint(root) for root in self.data]
+
+    def split(self, config: FitConfig, split: Split, *, limit: int | None = None) -> LoadedSplit:
+        """A split of the first tree as a configuration's network reads it; read once.
+
+        Args:
+            config: decides the sizes of images and maps, and the categories.
+            split: which one.
+            limit: at most so many shapes; if not given, all training shapes, or `self.limit` of the others.
+        """
+        size = image_size(config)
+        limit = limit or (self.limit if split != "train" else None)
+        key = (self.test_tree, limit, split, *size, config.map_size, config.gt_pool, config.categories)
+        if key not in self._splits:
+            self._splits[key] = read_split(
+                config, self.test_tree, split, image_size=size, limit=limit, progress=self.progress
+            )
+        return self._splits[key]
+
+    # Trainings
+
+    def run_key(self, config: FitConfig) -> dict[str, Any]:
+        """All that decides the weights of a training, but for the seed."""
+        fields = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_OF_THE_WEIGHTS}
+        return {"config": fields, "data": self.fingerprints(), "training_version": TRAINING_VERSION}
+
+    def run_of(self, config: FitConfig) -> Path:
+        """The directory of a configuration's run."""
+        return self.out / "runs" / f"{store.digest(self.run_key(config))}-seed{config.seed}"
+
+    def is_trained(self, config: FitConfig) -> bool:
+        """Is a configuration's training finished?"""
+        return (self.run_of(parts_of(config)[-1]) / "trained.json").exists()
+
+    def train(self, config: FitConfig, *, stage: Literal[1, 2] = 2) -> Path:
+        """The run that holds a stage of a configuration's training: trained now, continued, or there already.
+
+        Raises:
+            KeyboardInterrupt: a signal ended the training early; it has saved a checkpoint.
+        """
+        parts = parts_of(config)
+        run = self._train_part(parts[0], None)
+        if stage == 2 and len(parts) > 1:
+            run = self._train_part(parts[1], best_weights(run, 1))
+        return run
+
+    def _train_part(self, config: FitConfig, start: Path | None) -> Path:
+        """Trains one of `parts_of`; from the weights of the part before it, if it is not the first."""
+        run = self.run_of(config)
+        if self.is_trained(config):
+            return run
+        if start is not None:
+            stage1 = dataclasses.replace(config.stage1, steps=0)
+            config = dataclasses.replace(config, stage1=stage1, start=str(start))
+        saved = run / "config.json"
+        begun = saved.exists()
+        if begun:
+            config = fit_config_from_json(saved.read_text(), where=str(saved))
+        begin = time.process_time()  # wall-clock time would include what else the machine does
+        if not fit(self.data, run, config, resume=begun, progress=self.progress):
+            raise KeyboardInterrupt
+        seconds = round(time.process_time() - begin)
+        write_text(run / "trained.json", json.dumps({"seconds": seconds, "continued": begun}) + "\n")
+        return run
+
+    def missing_runs(self, configs: Sequence[FitConfig]) -> tuple[list[FitConfig], list[FitConfig]]:
+        """The runs that trainings still need, each once: those from fresh weights, and those that start from them."""
+        rounds: tuple[dict[Path, FitConfig], dict[Path, FitConfig]] = ({}, {})
+        for config in configs:
+            for found, part in zip(rounds, parts_of(config), strict=False):
+                if not self.is_trained(part):
+                    found.setdefault(self.run_of(part), part)
+        return list(rounds[0].values()), list(rounds[1].values())
+
+    def train_all(self, configs: Sequence[FitConfig]) -> None:
+        """Trains what is not trained yet, `processes` at once; the weights do not depend on how many.
+
+        Raises:
+            KeyboardInterrupt: as `train`.
+            UserError: one could not be trained; those that ran at the same time have been finished.
+        """
+        for missing in self.missing_runs(configs):
+            self.side_by_side(Study.train, [(config,) for config in missing], title="trainings")
+            threads = torch.get_num_threads()
+            torch.set_num_threads(1)
+            try:
+                for config in missing:
+                    self.train(config)
+            finally:
+                torch.set_num_threads(threads)
+
+    def network(self, config: FitConfig, *, stage: Literal[0, 1, 2] = 2) -> Predictor:
+        """A configuration's network with the best weights of a stage, trained if need be.
+
+        Stage 0 is the network before training; of a method without the stage, the last stage is taken.
+        """
+        if stage == 0:
+            torch.manual_seed(config.seed)
+            return build_network(config)
+        run = self.train(config, stage=stage)
+        has_stage = f"stage{stage}" in config.phases
+        return load_predictor(best_weights(run, stage) if has_stage else run)
+
+    # Measurements
+
+    def kept(self, key: Sequence[object], measure: Callable[[], Metrics]) -> Metrics:
+        """The metrics under a key of plain JSON values, measured now if they are not kept; see `store.kept`."""
+        return store.kept(self.out, key, measure if self.measures else None)
+
+    def measure(
+        self,
+        config: FitConfig,
+        what: object,
+        function: Callable[[Predictor, LoadedSplit], Metrics],
+        *,
+        stage: Literal[0, 1, 2] = 2,
+        split: Split = "test",
+    ) -> Metrics:
+        """What a function finds of a configuration's network on a split, trained and measured if need be.
+
+        Args:
+            config: whose network.
+            what: names the measurement, with everything that decides its outcome; plain JSON values.
+            function: makes it.
+            stage: see `network`.
+            split: of the first tree; of the training shapes a hundred, evenly spread.
+        """
+        data = self.split(config, split, limit=_SOME_TRAINING_SHAPES if split == "train" else None)
+        run = self.weights_key(stage1_of(config) if stage == 1 else config)
+        key = [*run, stage, what, split, data.fingerprint]
+        return self.kept(key, lambda: function(self.network(config, stage=stage), data))
+
+    def weights_key(self, config: FitConfig) -> list[Any]:
+        """The part of a measurement's key that names a configuration's weights."""
+        return [self.run_key(config), config.seed]
+
+    def reconstruction_metrics(
+        self,
+        config: FitConfig,
+        settings: InferenceConfig,
+        *,
+        stage: Literal[1, 2] = 2,
+        views: int,
+        split: Split = "test",
+        code_seed: int | None = None,
+    ) -> Metrics:
+        """Errors (M,) of what a configuration's network reconstructs from several views of each shape.
+
+        Args:
+            config: whose network; its seed draws views and codes.
+            settings: how the codes are chosen.
+            stage: of the weights.
+            views: per shape.
+            split: of the first tree.
+            code_seed: draws the codes in place of the configuration's seed.
+        """
+        what = [dataclasses.asdict(settings), views, *([] if code_seed is None else [code_seed])]
+        return self.measure(
+            config,
+            what,
+            lambda model, data: evaluate_split(
+                model, data, settings, views=views, seed=config.seed, code_seed=code_seed
+            ),
+            stage=stage,
+            split=split,
+        )
+
+    def retrieval_metrics(
+        self, baseline: Literal["medoid", "nearest image"], config: FitConfig, *, views: int
+    ) -> Metrics:
+        """Errors (M,) of a retrieval baseline on the data that a configuration reads.
+
+        Args:
+            baseline: the medoid of the training shapes, or for each test shape the training shape with the nearest
+                image.
+            config: decides the sizes of images and clouds.
+            views: from which images are retrieved.
+        """
+        test, train = self.split(config, "test"), self.split(config, "train")
+        points = cloud_size(config)
+
+        def measure() -> Metrics:
+            if baseline == "medoid":
+                clouds = train.points[medoid(train.points)].expand_as(test.points)
+            else:
+                clouds = train.points[nearest_by_image(test, train, views=(views,))[views]]
+            parts = zip(clouds.split(SHAPES_AT_ONCE), test.points.split(SHAPES_AT_ONCE), strict=True)
+            return concatenate(
+                [compare_clouds(cloud.contiguous(), true, points=points) for cloud, true in parts]
+            )
+
+        key = [baseline, points, image_size(config), views, train.fingerprint, test.fingerprint]
+        return self.kept(key, measure)
+
+    def is_kept(self, function: Callable[[Study], object]) -> bool:
+        """Are all metrics kept that a function takes from a study? Then it needs no network."""
+        return self._missing(function) is None
+
+    def _missing(self, function: Callable[[Study], object]) -> str | None:
+        """KEY of the first metrics that a function would have to measure."""
+        try:
+            function(dataclasses.replace(self, measures=False))
+        except NotMeasured as key:
+            return str(key)
+        return None
+
+    def measure_all(self, function: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
+        """Takes those of several measurements that are not kept, `processes` at once; one process leaves them for
+        later.
+
+        Args:
+            function: called with a study and each of the arguments; importable by name. Its result is dropped, the
+                metrics that it keeps stay.
+            arguments: can be pickled; the networks that they need are trained.
+
+        Raises:
+            KeyboardInterrupt: a signal ended it early; finished measurements are kept.
+        """
+        if self.processes == 1:  # nothing is saved by looking for what is missing
+            return
+        missing: dict[str, tuple[Any, ...]] = {}
+        for given in arguments:
+            key = self._missing(lambda study, given=given: function(study, *given))
+            if key is not None:
+                missing.setdefault(key, given)
+        self.side_by_side(function, list(missing.values()), title="measurements")
+
+    def side_by_side(self, function: Callable[..., object], calls: Sequence[tuple], *, title: str) -> None:
+        """Calls a function with a quiet study of one process and each of several arguments, `processes` at once.
+
+        One process, or a single call, does nothing: the caller makes it then. Results are dropped; what is kept on disk
+        stays.
+        """
+        if min(self.processes, len(calls)) < 2:
+            return
+        alone = dataclasses.replace(self, progress=False, processes=1, _splits={})
+        run_side_by_side(
+            functools.partial(_call, function),
+            [(alone, *call) for call in calls],
+            processes=self.processes,
+            title=title,
+            progress=self.progress,
+        )
+
+    def about(self, config: FitConfig) -> dict[str, Any]:
+        """What every result states of its making: profile, data, seeds, and the networks' configuration."""
+        return {
+            "profile": self.profile,
+            "data": [str(root) for root in self.data],
+            "seeds": self.seeds,
+            "config": dataclasses.asdict(config),
+        }
+
+
+def unchanged(config: FitConfig) -> FitConfig:
+    """Our own method as the profile has it."""
+    return config
+
+
+def of_method(name: Any) -> Change:
+    """The profile's recipe for another method."""
+    return functools.partial(with_system, system=name)
+
+
+def stage1_of(config: FitConfig) -> FitConfig:
+    """A configuration's training up to the end of stage 1; all of it if it cannot be split, see `parts_of`."""
+    if config.needs_autoencoder or not config.stage1.steps:
+        return config
+    # The same for every training with this stage 1, whatever follows.
+    nothing = dataclasses.replace(config.stage1, steps=0)
+    return dataclasses.replace(config, stage2=nothing, variant="standard")
+
+
+def parts_of(config: FitConfig) -> tuple[FitConfig, ...]:
+    """The runs that a training consists of: stage 1, and the whole, of which the second run trains the rest.
+
+    A critic learns through both stages: such a training is one run, and so is one with a single stage.
+    """
+    first = stage1_of(config)
+    return (first,) if first == config or not config.stage2.steps else (first, config)
+
+
+def _call(function: Callable[..., object], study: Study, *given: Any) -> None:
+    function(study, *given)  # the result is on disk, and need not be sent back
+
+
+def _tree_fingerprint(root: Path) -> str:
+    """Changes when a tree's lists, or what it was made with, change; only these files are read."""
+    files = sorted(root.glob("data_list/*/*.list")) + sorted(root.glob("made_with.json"))
+    if not files:
+        raise UserError(f"no data at {root}; make some with: python -m train data procedural --out {root}")
+    return store.digest([f"{path.relative_to(root)}\n{path.read_text()}" for path in files])
