@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from train.data import ShapeTree, store
+from train.data import ShapeTree, tree_files
 from train.data.meshes import convert
-from train.data.work import without_interrupts
 
 BOXES = 16
 SETTINGS = {"size": 112, "views": 6}
@@ -56,13 +55,13 @@ def test_a_killed_run_leaves_no_process_and_is_finished_by_the_next(tmp_path):
         command(tmp_path / "in", out, 2), start_new_session=True, stderr=subprocess.DEVNULL
     )
     deadline = time.monotonic() + 120
-    while not list(out.glob(f"{store.RENDERS}/*/box*")) and time.monotonic() < deadline:
+    while not list(out.glob(f"{tree_files.RENDERS}/*/box*")) and time.monotonic() < deadline:
         time.sleep(0.005)
     os.kill(run.pid, signal.SIGKILL)
     run.wait()
-    started = len(list(out.glob(f"{store.RENDERS}/*/box*")))
+    started = len(list(out.glob(f"{tree_files.RENDERS}/*/box*")))
     assert 1 <= started < BOXES  # it was killed in the middle
-    assert not (out / store.LISTS).exists()
+    assert not (out / tree_files.LISTS).exists()
     assert ends(run.pid)  # its workers went with it
 
     report = convert([tmp_path / "in"], out, processes=1, **SETTINGS)
@@ -102,18 +101,6 @@ def test_an_interrupted_run_ends_at_once_with_one_word(tmp_path):
     assert ends(run.pid)
 
 
-@pytest.mark.usefixtures("heeds_interrupts")
-def test_an_interrupt_while_workers_start_is_answered_when_they_have_started():
-    steps = []
-    with pytest.raises(KeyboardInterrupt), without_interrupts():
-        signal.raise_signal(signal.SIGINT)
-        steps.append("started")
-    assert steps == ["started"]
-    with without_interrupts():
-        steps.append("none came")
-    assert len(steps) == 2
-
-
 @pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs limits of the system")
 @pytest.mark.parametrize("processes", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_full_disk_stops_the_run_with_one_line(tmp_path, processes):
@@ -132,7 +119,7 @@ def test_a_full_disk_stops_the_run_with_one_line(tmp_path, processes):
     assert last.startswith("error: rendering meshes stopped: File too large")
     assert "run the same command again" in last
     assert "Traceback" not in result.stderr
-    assert not list(out.glob(f"{store.RENDERS}/*/*"))  # nothing half-written, not even hidden
+    assert not list(out.glob(f"{tree_files.RENDERS}/*/*"))  # nothing half-written, not even hidden
     if processes == 1:
         assert convert([tmp_path / "in"], out, processes=1, **SETTINGS).made == BOXES
 
@@ -160,5 +147,7 @@ def test_three_million_faces_take_neither_all_memory_nor_all_day(tmp_path):
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert after.ru_utime - before.ru_utime < 120
     assert after.ru_maxrss < 3e6  # kB
-    shapes = [shape for split in store.SPLITS for shape in ShapeTree(tmp_path / "out", split).iter_valid()]
+    shapes = [
+        shape for split in tree_files.SPLITS for shape in ShapeTree(tmp_path / "out", split).iter_valid()
+    ]
     assert sorted(shape.id for shape in shapes) == ["unknown/ball", "unknown/box"]

@@ -18,10 +18,11 @@ import torch
 from torch import Tensor
 
 from diffpoint.io import read_points, write_points
-from train.data import ShapeTree, store
+from train.data import ShapeTree, tree_files
 from train.data.batches import LoadedSplit, Sampler, load_split
 from train.data.cache import prepare
-from train.data.shrink import Sizes, SmallShape, shrink
+from train.data.shape import Shape
+from train.data.shrink import Sizes, shrink
 from train.data.tree import _found_frame, read_shape
 
 SIZES = Sizes((48, 64), 16)
@@ -38,17 +39,17 @@ def tree(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return root
 
 
-def _prepare(root: Path) -> dict[str, SmallShape]:
+def _prepare(root: Path) -> dict[str, Shape]:
     shapes = prepare(root, ShapeTree(root, "train").ids, SIZES, progress=False)
-    assert all(isinstance(shape, SmallShape) for shape in shapes.values())
-    return {name: shape for name, shape in shapes.items() if isinstance(shape, SmallShape)}
+    assert all(isinstance(shape, Shape) for shape in shapes.values())
+    return {name: shape for name, shape in shapes.items() if isinstance(shape, Shape)}
 
 
-def _fresh(root: Path) -> dict[str, SmallShape]:
+def _fresh(root: Path) -> dict[str, Shape]:
     return {name: shrink(read_shape(root, name), SIZES) for name in ShapeTree(root, "train").ids}
 
 
-def _same(some: dict[str, SmallShape], others: dict[str, SmallShape]) -> bool:
+def _same(some: dict[str, Shape], others: dict[str, Shape]) -> bool:
     return list(some) == list(others) and all(
         (a.dtype == b.dtype and torch.equal(a, b))
         if isinstance(a, Tensor) and isinstance(b, Tensor)
@@ -75,7 +76,7 @@ def test_prepared_shapes_are_those_of_a_fresh_reading(tree: Path) -> None:
 def test_no_picture_is_decoded_twice(tree: Path) -> None:
     """Pictures that cannot be decoded any more are not missed, as long as nothing says that they have changed."""
     before = _prepare(tree)
-    for picture in (tree / store.RENDERS).rglob("*.png"):
+    for picture in (tree / tree_files.RENDERS).rglob("*.png"):
         status = picture.stat()
         picture.write_bytes(b"x" * status.st_size)
         os.utime(picture, ns=(status.st_atime_ns, status.st_mtime_ns))
@@ -95,24 +96,24 @@ def test_other_sizes_have_files_of_their_own(tree: Path) -> None:
     ids = ShapeTree(tree, "train").ids[:1]
     for sizes in (SIZES, Sizes((48, 64), 16, "min"), Sizes((24, 32), 16), Sizes((48, 64), 32)):
         (shape,) = prepare(tree, ids, sizes, progress=False).values()
-        assert isinstance(shape, SmallShape)
+        assert isinstance(shape, Shape)
         assert shape.images.shape[-2:] == sizes.image_size
         assert shape.depth.shape[-1] == sizes.map_size
     assert len(list((tree / ".prepared").rglob("*.safetensors"))) == 4
 
 
 def _repaint(root: Path, shape: str) -> None:
-    path = store.render_folder(root, shape) / "render_0.png"
+    path = tree_files.render_folder(root, shape) / "render_0.png"
     imageio.imwrite(path, 255 - imageio.imread(path))
 
 
 def _lose_a_view(root: Path, shape: str) -> None:
     for kind in ("render_3.png", "depth_3.png", "camera_3.json"):
-        (store.render_folder(root, shape) / kind).unlink()
+        (tree_files.render_folder(root, shape) / kind).unlink()
 
 
 def _move_the_cloud(root: Path, shape: str) -> None:
-    file = store.cloud_file(root, shape)
+    file = tree_files.cloud_file(root, shape)
     later = file.stat().st_mtime_ns + 1_000_000
     content = bytearray(file.read_bytes())
     content[-1] ^= 1
@@ -205,7 +206,7 @@ def test_a_turned_tree_is_read_again(tree: Path, capsys: pytest.CaptureFixture[s
     """A tree from elsewhere, whose clouds turn out to be in another frame than was thought."""
     (tree / "made_with.json").unlink()
     before = _prepare(tree)
-    for file in (tree / store.CLOUDS).rglob("*.ply"):
+    for file in (tree / tree_files.CLOUDS).rglob("*.ply"):
         status = file.stat()
         points = read_points(file)
         write_points(file, points[:, [0, 2, 1]] * torch.tensor([1.0, -1.0, 1.0]))  # z up
@@ -243,10 +244,11 @@ import sys
 from pathlib import Path
 from train.data import ShapeTree
 from train.data.cache import prepare
-from train.data.shrink import Sizes, SmallShape
+from train.data.shape import Shape
+from train.data.shrink import Sizes
 root = Path(sys.argv[1])
 shapes = prepare(root, ShapeTree(root, "train").ids, Sizes((48, 64), 16))
-assert all(isinstance(shape, SmallShape) for shape in shapes.values()), shapes
+assert all(isinstance(shape, Shape) for shape in shapes.values()), shapes
 assert not any(name.split(".")[0] == "taichi" for name in sys.modules), "the kernels were started"
 print(sum(int(shape.images.sum()) for shape in shapes.values()))
 """
@@ -254,13 +256,15 @@ print(sum(int(shape.images.sum()) for shape in shapes.values()))
 
 def _begin_elsewhere(tree: Path) -> subprocess.Popen[str]:
     """A process that has begun to prepare a tree, of now many shapes, and has a while to go."""
-    for synset in (tree / store.LISTS / "train").glob("*.list"):
+    for synset in (tree / tree_files.LISTS / "train").glob("*.list"):
         lines = synset.read_text().split()
         for copy in (f"{line}_copy{k}" for line in lines[:4] for k in range(12)):
             lines.append(copy)
             original = copy.split("_copy")[0]
-            (tree / store.RENDERS / copy).symlink_to(tree / store.RENDERS / original)
-            (tree / store.CLOUDS / f"{copy}.ply").symlink_to(tree / store.CLOUDS / f"{original}.ply")
+            (tree / tree_files.RENDERS / copy).symlink_to(tree / tree_files.RENDERS / original)
+            (tree / tree_files.CLOUDS / f"{copy}.ply").symlink_to(
+                tree / tree_files.CLOUDS / f"{original}.ply"
+            )
         synset.write_text("\n".join(lines))
     process = subprocess.Popen(
         [sys.executable, "-c", _PREPARE, str(tree)],

@@ -14,8 +14,9 @@ from PIL import Image
 
 from diffpoint.io import read_depth, read_points, write_depth, write_points
 from train.__main__ import main
-from train.data import ShapeTree, store
-from train.data.check import agreement, check_tree
+from train.data import ShapeTree, tree_files
+from train.data.check import check_tree
+from train.data.consistency import measure_consistency
 from train.data.meshes import convert
 from train.data.procedural import generate
 from train.errors import UserError
@@ -32,9 +33,9 @@ def procedural(tmp_path_factory):
 
 def assert_agrees(report, shapes):
     assert report.problems == []
-    assert len(report.agreements) == shapes
+    assert len(report.consistencies) == shapes
     assert report.inside >= 0.99
-    for each in report.agreements:
+    for each in report.consistencies:
         assert each.inside >= 0.99, each
         assert each.residual < 0.01, each
     assert "no problems" in report.summary()
@@ -80,7 +81,7 @@ def test_each_way_to_disagree_is_seen(procedural):
     tree = ShapeTree(procedural)
     # A deep body, so that no half turn maps the shape to itself.
     shape = next(each for each in tree.iter_valid() if each.id.endswith(("_h1", "_h2")))
-    assert agreement(shape).holds
+    assert measure_consistency(shape).holds
     flip = torch.diag(torch.tensor([1.0, 1, -1]))
     turn = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     pushed = shape.camera.cam_from_world.clone()
@@ -97,22 +98,22 @@ def test_each_way_to_disagree_is_seen(procedural):
         "pixels off by three": shape_with(shape, depth=shape.depth.roll(3, -1)),
     }
     for name, each in wrong.items():
-        assert not agreement(each).holds, name
+        assert not measure_consistency(each).holds, name
 
 
 def test_problems_are_named(procedural, tmp_path):
     root = tmp_path / "data"
     shutil.copytree(procedural, root)
-    ids = [shape for split in store.SPLITS for shape in ShapeTree(root, split).ids]
+    ids = [shape for split in tree_files.SPLITS for shape in ShapeTree(root, split).ids]
     broken, moved, unlisted, absent, doubled = ids[:5]
-    (store.render_folder(root, broken) / "depth_2.png").write_bytes(b"no")
-    camera = store.render_folder(root, moved) / "camera_0.json"
+    (tree_files.render_folder(root, broken) / "depth_2.png").write_bytes(b"no")
+    camera = tree_files.render_folder(root, moved) / "camera_0.json"
     record = json.loads(camera.read_text())
     record["cam_from_world"] = (np.diag([-1.0, -1, 1, 1]) @ np.array(record["cam_from_world"])).tolist()
     camera.write_text(json.dumps(record))
-    store.cloud_file(root, absent).unlink()
-    for split in store.SPLITS:
-        for path in (root / store.LISTS / split).glob("*.list"):
+    tree_files.cloud_file(root, absent).unlink()
+    for split in tree_files.SPLITS:
+        for path in (root / tree_files.LISTS / split).glob("*.list"):
             lines = [line for line in path.read_text().split() if line != unlisted]
             lines += [doubled] if doubled in lines else []
             path.write_text("".join(f"{line}\n" for line in lines))
@@ -187,9 +188,9 @@ FILES = (("render", "png"), ("depth", "png"), ("camera", "json"))
 def test_each_kind_of_damage_is_one_line_and_the_other_shapes_stand(procedural, tmp_path, capsys):
     root = tmp_path / "data"
     shutil.copytree(procedural, root)
-    trees = [ShapeTree(root, split) for split in store.SPLITS]
+    trees = [ShapeTree(root, split) for split in tree_files.SPLITS]
     victim = max(trees, key=len).ids[1]
-    folder, copy = store.render_folder(root, victim), tmp_path / "copy"
+    folder, copy = tree_files.render_folder(root, victim), tmp_path / "copy"
     shutil.copytree(folder, copy)
     whole = sum(map(len, trees))
     for name, (damage, said) in DAMAGES.items():
@@ -198,7 +199,7 @@ def test_each_kind_of_damage_is_one_line_and_the_other_shapes_stand(procedural, 
         about = [problem for problem in report.problems if problem.startswith(victim)]
         assert [problem for problem in about if re.search(said, problem)], (name, report.problems)
         assert len(report.problems) == len(about) <= 2, (name, report.problems)
-        assert sum(each.holds for each in report.agreements if each.id != victim) == whole - 1
+        assert sum(each.holds for each in report.consistencies if each.id != victim) == whole - 1
         shutil.rmtree(folder)
         shutil.copytree(copy, folder)
     assert check_tree(root, processes=1).problems == []
@@ -212,13 +213,13 @@ def test_each_kind_of_damage_is_one_line_and_the_other_shapes_stand(procedural, 
 def test_pictures_of_another_object_and_shapes_unlike_the_rest_are_named(procedural, tmp_path):
     root = tmp_path / "data"
     shutil.copytree(procedural, root)
-    ids = [shape for split in store.SPLITS for shape in ShapeTree(root, split).ids]
+    ids = [shape for split in tree_files.SPLITS for shape in ShapeTree(root, split).ids]
     chair = next(shape for shape in ids if shape.startswith("03001627"))
     display = next(shape for shape in ids if shape.startswith("03211117"))
-    chair_image = store.render_folder(root, chair) / "render_2.png"
-    shutil.copy(chair_image, store.render_folder(root, display) / "render_2.png")
+    chair_image = tree_files.render_folder(root, chair) / "render_2.png"
+    shutil.copy(chair_image, tree_files.render_folder(root, display) / "render_2.png")
     few = ids[-1]
-    write_points(store.cloud_file(root, few), read_points(store.cloud_file(root, few))[::2])
+    write_points(tree_files.cloud_file(root, few), read_points(tree_files.cloud_file(root, few))[::2])
     problems = check_tree(root, processes=1).problems
     assert [p for p in problems if p.startswith(f"{display}: view 2: ") and "outside the mask" in p], problems
     assert [p for p in problems if p == f"{few}: 1024 points, elsewhere 2048"], problems
@@ -228,7 +229,7 @@ def test_pictures_of_another_object_and_shapes_unlike_the_rest_are_named(procedu
 def test_a_tree_of_ours_whose_clouds_were_turned_is_not_turned_back_in_silence(procedural, tmp_path):
     root = tmp_path / "data"
     shutil.copytree(procedural, root)
-    for cloud in (root / store.CLOUDS).glob("*/*.ply"):
+    for cloud in (root / tree_files.CLOUDS).glob("*/*.ply"):
         x, y, z = read_points(cloud).T
         write_points(cloud, torch.stack((x, -z, y), 1))
     report = check_tree(root, processes=1)

@@ -12,9 +12,9 @@ from PIL import Image
 from diffpoint.camera import PinholeCamera
 from diffpoint.io import read_points, write_points
 from train.__main__ import main
-from train.data import ShapeTree, store
+from train.data import ShapeTree, tree_files
 from train.data.check import check_tree
-from train.data.choy import cam_from_world, pictures_of
+from train.data.choy_layout import cam_from_world, pictures_of
 from train.data.render import Renderer
 from train.data.surface import Surface
 from train.errors import UserError
@@ -79,7 +79,7 @@ def choy(tmp_path_factory):
         mesh = trimesh.util.concatenate([box.apply_translation(rng.uniform(-0.3, 0.3, 3)) for box in boxes])
         mesh.apply_translation(-mesh.bounds.mean(0)).apply_scale(1 / np.linalg.norm(mesh.extents))
         write_model(root / "ShapeNetRendering" / shape / "rendering", mesh, rng)
-        cloud = root / store.CLOUDS / f"{shape}.ply"
+        cloud = root / tree_files.CLOUDS / f"{shape}.ply"
         cloud.parent.mkdir(parents=True, exist_ok=True)
         write_points(cloud, torch.from_numpy(trimesh.sample.sample_surface(mesh, 2048, seed=0)[0]).float())
     return root
@@ -87,7 +87,7 @@ def choy(tmp_path_factory):
 
 def test_a_tree_is_read_and_its_cameras_fit_its_clouds(choy, capsys):
     for path in (choy, choy / "ShapeNetRendering"):
-        trees = [ShapeTree(path, split) for split in store.SPLITS]
+        trees = [ShapeTree(path, split) for split in tree_files.SPLITS]
         assert sum(map(len, trees)) == 12
         assert all(len(tree) for tree in trees)
     shape = trees[0][0]
@@ -104,7 +104,7 @@ def test_a_tree_is_read_and_its_cameras_fit_its_clouds(choy, capsys):
 def test_lists_are_followed_where_there_are_some(choy, tmp_path):
     root = tmp_path / "data"
     shutil.copytree(choy, root)
-    lists = root / store.LISTS / "test"
+    lists = root / tree_files.LISTS / "test"
     lists.mkdir(parents=True)
     named = f"{CHAIR}/{4:032x}"
     (lists / f"{CHAIR}.list").write_text(f"{named}\n")
@@ -115,7 +115,7 @@ def test_lists_are_followed_where_there_are_some(choy, tmp_path):
 def test_clouds_with_z_up_are_turned(choy, tmp_path):
     root = tmp_path / "data"
     shutil.copytree(choy, root)
-    for path in (root / store.CLOUDS).glob("*/*.ply"):
+    for path in (root / tree_files.CLOUDS).glob("*/*.ply"):
         x, y, z = read_points(path).T
         write_points(path, torch.stack((x, -z, y), 1))
     report = check_tree(root, processes=1)
@@ -167,7 +167,7 @@ def test_broken_models_are_named_and_the_others_stand(choy, tmp_path, kind):
     report = check_tree(root, processes=1)
     assert [problem for problem in report.problems if problem.startswith(victim) and re.search(said, problem)]
     assert all(problem.startswith(victim) for problem in report.problems)
-    assert sum(each.holds for each in report.agreements) == 11
+    assert sum(each.holds for each in report.consistencies) == 11
 
 
 def test_a_run_is_evaluated_on_it(choy, smoke_run, tmp_path, capsys):

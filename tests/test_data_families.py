@@ -9,11 +9,11 @@ from PIL import Image
 from scipy.spatial import KDTree
 
 from train.__main__ import main
+from train.data.ambiguity_check import measure_families, measure_tree
 from train.data.families import AMBIGUOUS, FAMILIES, MODES, Cone
-from train.data.portraits import draw_families
+from train.data.family_pictures import draw_families
 from train.data.procedural import ambiguity, generate, variants_of
 from train.data.render import MAX_RADIUS, Renderer, orbit_camera
-from train.data.rules import measure, measure_tree
 from train.data.solids import (
     bar,
     body,
@@ -88,23 +88,23 @@ def test_a_body_that_shows_is_refused():
 
 
 def test_rules_are_measured_and_broken_ones_are_named(monkeypatch):
-    report = measure(["display", "car"], objects=1, seed=4, processes=1)
+    report = measure_families(["display", "car"], objects=1, seed=4, processes=1)
     assert report.broken == []
     assert "all rules hold" in report.summary()
-    assert {name: list(figures) for name, figures in report.figures.items()} == {
+    assert {name: list(figures) for name, figures in report.measured.items()} == {
         "display": ["display 4"],
         "car": ["car 4"],
     }
     same = variants_of("display", 0)[:1] * MODES
-    monkeypatch.setattr("train.data.rules.variants_of", lambda *_: same)
-    report = measure(["display"], objects=1, processes=1)
+    monkeypatch.setattr("train.data.ambiguity_check.variants_of", lambda *_: same)
+    report = measure_families(["display"], objects=1, processes=1)
     assert len(report.broken) == 1
     assert "display 0: front 0.00%, back 0%" in report.summary()
     assert main(["data", "rules", "--categories", "display", "--objects", "1"]) == 1
     with pytest.raises(UserError, match=r"called lamp; there are: chair"):
-        measure(["lamp"])
+        measure_families(["lamp"])
     with pytest.raises(UserError, match="objects must be"):
-        measure(objects=0)
+        measure_families(objects=0)
 
 
 def test_the_rules_are_measured_on_the_objects_of_a_dataset(tmp_path):
@@ -120,7 +120,7 @@ def test_the_rules_are_measured_on_the_objects_of_a_dataset(tmp_path):
             variants=2,
         )
     report = measure_tree(tmp_path / "data", processes=1)
-    assert {name: list(figures) for name, figures in report.figures.items()} == {
+    assert {name: list(figures) for name, figures in report.measured.items()} == {
         "cabinet": ["cabinet_s7_000001"]
     }
     assert report.broken == []

@@ -11,9 +11,9 @@ import trimesh
 
 from diffpoint.io import read_points, write_points
 from train.__main__ import main
-from train.data import Shape, ShapeTree, store
+from train.data import Shape, ShapeTree, tree_files
+from train.data.axis_frames import TURNS, describe, find_frame
 from train.data.check import check_tree
-from train.data.frames import TURNS, describe, find_frame
 from train.data.procedural import generate
 from train.data.render import Renderer, draw_camera
 from train.data.surface import Surface
@@ -38,11 +38,13 @@ def as_archive(ours, root, *, cloud=None, world=None, camera=None):
     """
     shutil.copytree(ours, root)
     (root / "made_with.json").unlink()
-    for path in (root / store.LISTS / "val").glob("*.list"):  # the archive has lists to train and to test
-        with (root / store.LISTS / "train" / path.name).open("a") as lines:
+    for path in (root / tree_files.LISTS / "val").glob(
+        "*.list"
+    ):  # the archive has lists to train and to test
+        with (root / tree_files.LISTS / "train" / path.name).open("a") as lines:
             lines.write(path.read_text())
-    shutil.rmtree(root / store.LISTS / "val")
-    for path in (root / store.RENDERS).glob("*/*/camera_*.json"):
+    shutil.rmtree(root / tree_files.LISTS / "val")
+    for path in (root / tree_files.RENDERS).glob("*/*/camera_*.json"):
         record = json.loads(path.read_text())
         pose, turn = np.array(record["cam_from_world"]), np.eye(4)
         if world is not None:
@@ -59,13 +61,13 @@ def as_archive(ours, root, *, cloud=None, world=None, camera=None):
         scipy.io.savemat(path.with_suffix(".mat"), values)
         path.unlink()
     if cloud is not None:
-        for path in (root / store.CLOUDS).glob("*/*.ply"):
+        for path in (root / tree_files.CLOUDS).glob("*/*.ply"):
             write_points(path, read_points(path) @ torch.from_numpy(cloud).float().T)
     return root
 
 
-def assert_same_shapes(ours, theirs, splits=store.SPLITS):
-    here = {shape.id: shape for split in store.SPLITS for shape in ShapeTree(ours, split).iter_valid()}
+def assert_same_shapes(ours, theirs, splits=tree_files.SPLITS):
+    here = {shape.id: shape for split in tree_files.SPLITS for shape in ShapeTree(ours, split).iter_valid()}
     there = {shape.id: shape for split in splits for shape in ShapeTree(theirs, split).iter_valid()}
     assert here.keys() == there.keys()
     for shape in here.values():
@@ -165,7 +167,7 @@ def test_mirrored_clouds_are_told_from_turned_ones():
 
 def test_clouds_of_other_models_are_no_matter_of_frames(ours, tmp_path):
     root = as_archive(ours, tmp_path / "archive")
-    for synset in (root / store.CLOUDS).iterdir():
+    for synset in (root / tree_files.CLOUDS).iterdir():
         clouds = sorted(synset.iterdir())
         points = [read_points(path) for path in clouds]
         for path, other in zip(clouds, points[5:] + points[:5], strict=True):
@@ -179,13 +181,15 @@ def test_clouds_of_other_models_are_no_matter_of_frames(ours, tmp_path):
 def test_validation_shapes_come_from_the_training_list(ours, tmp_path):
     root = as_archive(ours, tmp_path / "archive")
     named = {
-        line for path in (root / store.LISTS / "train").glob("*.list") for line in path.read_text().split()
+        line
+        for path in (root / tree_files.LISTS / "train").glob("*.list")
+        for line in path.read_text().split()
     }
     train, val = (set(ShapeTree(root, split).ids) for split in ("train", "val"))
     assert train | val == named
     assert not train & val
     many = [f"03001627/m{i}" for i in range(3000)]
-    (root / store.LISTS / "train" / "03001627.list").write_text("\n".join(many))
+    (root / tree_files.LISTS / "train" / "03001627.list").write_text("\n".join(many))
     skipped = {split: len(ShapeTree(root, split, ["chair"]).skipped) for split in ("train", "val")}
     assert skipped["train"] + skipped["val"] == 3000
     assert skipped["val"] / 3000 == pytest.approx(0.1, abs=0.02)
@@ -193,7 +197,7 @@ def test_validation_shapes_come_from_the_training_list(ours, tmp_path):
 
 def test_clouds_under_the_name_of_their_own_archive_are_found(ours, tmp_path):
     root = as_archive(ours, tmp_path / "archive")
-    (root / store.CLOUDS).rename(root / "shape_net_core_uniform_samples_2048")
+    (root / tree_files.CLOUDS).rename(root / "shape_net_core_uniform_samples_2048")
     assert_same_shapes(ours, root)
 
 

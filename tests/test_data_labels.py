@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from train.data.sources import Label, MeshFile, keep_labelled, read_labels
+from train.data.mesh_sources import Label, MeshFile, keep_labelled, read_labels
 from train.errors import UserError
 
 SHIPPED = Path(__file__).parents[1] / "train" / "data" / "furniture_labels.csv"

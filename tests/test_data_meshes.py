@@ -9,12 +9,12 @@ import pytest
 import trimesh
 from PIL import Image
 
-from train.data import ShapeTree, store
-from train.data.hidden import sample_seen
+from train.data import ShapeTree, tree_files
+from train.data.mesh_sources import find_meshes, read_labels, shape_ids
 from train.data.meshes import LEFT_OUT, MeshError, MeshOptions, MeshReport, convert, load_surface
 from train.data.rasterise import Rasteriser
 from train.data.render import Orbit, Renderer, draw_camera
-from train.data.sources import find_meshes, read_labels, shape_ids
+from train.data.visible_samples import sample_visible
 from train.errors import UserError
 
 SMALL = {"size": 32, "views": 2, "processes": 1}
@@ -27,7 +27,7 @@ def save_box(path, extents=(1.0, 2.0, 3.0)):
 
 
 def all_shapes(root):
-    return [shape for split in store.SPLITS for shape in ShapeTree(root, split).iter_valid()]
+    return [shape for split in tree_files.SPLITS for shape in ShapeTree(root, split).iter_valid()]
 
 
 def bad_meshes(folder):
@@ -245,11 +245,11 @@ def test_names_are_unique_even_where_letters_are_lost(tmp_path):
 def test_a_restarted_conversion_keeps_what_is_there(tmp_path):
     save_box(tmp_path / "in" / "a.obj")
     first = convert([tmp_path / "in"], tmp_path / "out", labels=None, **SMALL)
-    stamp = next((tmp_path / "out" / store.RENDERS).glob("*/a/render_0.png")).stat().st_mtime_ns
+    stamp = next((tmp_path / "out" / tree_files.RENDERS).glob("*/a/render_0.png")).stat().st_mtime_ns
     save_box(tmp_path / "in" / "b.obj")
     second = convert([tmp_path / "in"], tmp_path / "out", labels=None, **SMALL)
     assert (first.made, second.made, second.kept) == (1, 1, 1)
-    assert next((tmp_path / "out" / store.RENDERS).glob("*/a/render_0.png")).stat().st_mtime_ns == stamp
+    assert next((tmp_path / "out" / tree_files.RENDERS).glob("*/a/render_0.png")).stat().st_mtime_ns == stamp
 
 
 def test_unreadable_is_a_mesh_error(tmp_path):
@@ -312,11 +312,11 @@ def test_other_settings_into_the_same_folder_are_refused(tmp_path):
     save_box(tmp_path / "in" / "a.obj")
     convert([tmp_path / "in"], tmp_path / "out", **SMALL)
     for options, message in (
-        (MeshOptions(up="z"), "up 'y' there, 'z' now"),
-        (MeshOptions(scale=0.1), "scale None there, 0.1 now"),
-        (MeshOptions(drop_hidden=True), "drop hidden False there, True now"),
+        (MeshOptions(up="z"), "up: 'y' there, 'z' now"),
+        (MeshOptions(scale=0.1), "scale: None there, 0.1 now"),
+        (MeshOptions(drop_hidden=True), "drop hidden: False there, True now"),
         (MeshOptions(orbit=Orbit(elevation_deg=(0.0, 10.0))), "elevation"),
-        (MeshOptions(orbit=Orbit(distance=3.0)), "distance 2.0 there, 3.0 now"),
+        (MeshOptions(orbit=Orbit(distance=3.0)), "distance: 2.0 there, 3.0 now"),
         (MeshOptions(orbit=Orbit(focal=1.5)), "focal"),
     ):
         with pytest.raises(UserError, match=message):
@@ -406,7 +406,7 @@ def test_hidden_points_are_dropped_as_an_option(tmp_path):
     reach = np.abs(every).max(1)
     assert np.isclose(reach, 0.15, atol=1e-3).sum() > 100  # the innermost box
     reach = np.abs(seen).max(1)
-    assert len(seen) == store.POINTS
+    assert len(seen) == tree_files.POINTS
     assert not np.isclose(reach, 0.15, atol=1e-3).any()
     assert np.isclose(reach, 0.2, atol=1e-3).sum() > 100  # the closed box, seen through the open side
     share = np.isclose(reach, 0.5, atol=1e-3).mean()
@@ -418,5 +418,5 @@ def test_hidden_points_without_embree(tmp_path):
     trimesh.util.concatenate([outer, inner]).export(tmp_path / "a.ply")
     renderer = Renderer(load_surface(tmp_path / "a.ply"), Rasteriser)
     camera = draw_camera(np.random.default_rng(0), 2, 64)
-    points = sample_seen(renderer, camera, 300, np.random.default_rng(0))
+    points = sample_visible(renderer, camera, 300, np.random.default_rng(0))
     np.testing.assert_allclose(np.abs(points).max(1), 0.5 / np.sqrt(3), atol=1e-6)

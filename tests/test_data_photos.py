@@ -295,7 +295,7 @@ def test_running_again_makes_what_is_missing_and_nothing_else(studio, tmp_path):
     assert (report.kept, len(report.found), report.objects) == (3, 6, 3)
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in before.items())
     assert len(json.loads((out / "photos.json").read_text())["found"]) == 9
-    with pytest.raises(UserError, match="size 224 there, 112 now"):
+    with pytest.raises(UserError, match="size: 224 there, 112 now"):
         convert_photos(studio[0], out, size=112)
 
 

@@ -1,14 +1,11 @@
 """Generating procedural data: what is written, and that the same seed gives the same bits."""
 
-import os
-
 import pytest
 
-from train.data import ShapeTree, store
+from train.data import ShapeTree, tree_files
 from train.data.categories import SYNSET_OF
 from train.data.families import FAMILIES
 from train.data.procedural import generate
-from train.data.work import run_all
 from train.errors import UserError
 
 PAIR = ["chair", "display"]
@@ -29,7 +26,7 @@ def test_generate_writes_what_it_says(small):
     out, report = small
     assert report.made == 10
     assert "10 shapes" in report.summary()
-    trees = [ShapeTree(out, split) for split in store.SPLITS]
+    trees = [ShapeTree(out, split) for split in tree_files.SPLITS]
     shapes = [shape for tree in trees for shape in tree.iter_valid()]
     assert len(shapes) == 10
     assert not any(tree.skipped for tree in trees)
@@ -52,7 +49,7 @@ def test_all_families_are_the_paper_s_and_are_generated_by_default(tmp_path):
     )
     assert report.failures == {}
     assert report.made == sum(family.modes for family in FAMILIES.values())
-    folders = (tmp_path / "data" / store.RENDERS).glob("*/*")
+    folders = (tmp_path / "data" / tree_files.RENDERS).glob("*/*")
     assert {folder.name.split("_")[0] for folder in folders} == set(FAMILIES)
 
 
@@ -65,10 +62,10 @@ def test_other_seed_other_shapes(small, tmp_path):
 def test_a_restarted_run_keeps_what_is_there_and_adds_the_rest(tmp_path):
     arguments = {"categories": ["display"], "seed": 0, "size": 32, "views": 2, "processes": 1}
     generate(tmp_path / "data", shapes=2, **arguments)
-    before = tree_bytes(tmp_path / "data" / store.RENDERS)
+    before = tree_bytes(tmp_path / "data" / tree_files.RENDERS)
     report = generate(tmp_path / "data", shapes=3, **arguments)
     assert (report.made, report.kept) == (1, 2)
-    after = tree_bytes(tmp_path / "data" / store.RENDERS)
+    after = tree_bytes(tmp_path / "data" / tree_files.RENDERS)
     assert before.items() < after.items()
 
 
@@ -76,10 +73,13 @@ def test_variants_share_views_of_one_object(tmp_path):
     generate(
         tmp_path / "data", shapes=1, categories=["chair"], seed=0, size=32, views=2, processes=1, variants=3
     )
-    folders = sorted((tmp_path / "data" / store.RENDERS).glob("*/*"))
+    folders = sorted((tmp_path / "data" / tree_files.RENDERS).glob("*/*"))
     assert [folder.name[-3:] for folder in folders] == ["_h0", "_h1", "_h2"]
     assert len({(folder / "camera_0.json").read_text() for folder in folders}) == 1
-    assert len({store.cloud_file(tmp_path / "data", f"03001627/{f.name}").read_bytes() for f in folders}) == 3
+    assert (
+        len({tree_files.cloud_file(tmp_path / "data", f"03001627/{f.name}").read_bytes() for f in folders})
+        == 3
+    )
 
 
 @pytest.mark.parametrize(
@@ -97,15 +97,3 @@ def test_wrong_requests_leave_nothing_behind(tmp_path, changes, message):
     with pytest.raises(UserError, match=message):
         generate(tmp_path / "data", **(arguments | changes))
     assert not (tmp_path / "data").exists()
-
-
-def die_on_two(job):
-    if job == 2:
-        os._exit(1)
-    return job * 10
-
-
-def test_a_process_that_dies_takes_no_other_job_with_it():
-    results = dict(run_all(die_on_two, list(range(3)), processes=2, desc="dying", unit="job"))
-    assert isinstance(results.pop(2), OSError)
-    assert results == {0: 0, 1: 10}

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from train.__main__ import main
-from train.data import ShapeTree, store
+from train.data import ShapeTree, tree_files
 from train.data.contact_sheet import _arranged, show, strip_of
 from train.data.procedural import generate
 from train.errors import UserError
@@ -71,7 +71,7 @@ def test_broken_shapes_are_left_out_and_mistakes_named(data, tmp_path, capsys):
         show(data, tmp_path, shapes=0)
     root = tmp_path / "broken"
     generate(root, shapes=2, categories=["lamp"], seed=1, size=32, views=1, processes=1)
-    folders = sorted((root / store.RENDERS).glob("*/*"))
+    folders = sorted((root / tree_files.RENDERS).glob("*/*"))
     (folders[0] / "depth_0.png").write_bytes(b"no")
     assert main(["data", "show", str(root)]) == 0
     assert "lamp: " in capsys.readouterr().out

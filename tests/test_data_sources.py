@@ -8,9 +8,9 @@ import pytest
 import trimesh
 from PIL import Image
 
-from train.data import ShapeTree, store
+from train.data import ShapeTree, tree_files
+from train.data.mesh_sources import UPRIGHT, find_meshes, keep_labelled, of_category, read_labels, shape_ids
 from train.data.meshes import convert, load_surface
-from train.data.sources import UPRIGHT, find_meshes, keep_labelled, of_category, read_labels, shape_ids
 
 SMALL = {"size": 32, "views": 2, "processes": 1}
 BOX = trimesh.creation.box((1.0, 2.0, 3.0))
@@ -44,7 +44,9 @@ def test_shapenet_trees_of_both_versions_with_their_textures(tmp_path):
     report = convert([v1, v2], tmp_path / "out", **SMALL)
     assert not report.failures
     assert report.categories == {"02747177": 1, "chair": 1, "airplane": 1}
-    shapes = [shape for split in store.SPLITS for shape in ShapeTree(tmp_path / "out", split).iter_valid()]
+    shapes = [
+        shape for split in tree_files.SPLITS for shape in ShapeTree(tmp_path / "out", split).iter_valid()
+    ]
     assert {shape.id for shape in shapes} == {
         "03001627/1a6f61",
         "02747177/ab12",

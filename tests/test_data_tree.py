@@ -8,7 +8,7 @@ import pytest
 import scipy.io
 import trimesh
 
-from train.data import ShapeError, ShapeTree, store
+from train.data import ShapeError, ShapeTree, tree_files
 from train.data.render import Views, orbit_camera
 from train.errors import UserError
 
@@ -23,7 +23,7 @@ def write(root, shape, *, seed=0, views=2):
     camera = orbit_camera(rng.uniform(0, 360, views), rng.uniform(-20, 40, views), SIZE)
     points = rng.normal(size=(50, 3)).astype(np.float32)
     written = Views(images, depth, camera)
-    store.write_shape(root, shape, written, points)
+    tree_files.write_shape(root, shape, written, points)
     return written, points
 
 
@@ -32,14 +32,14 @@ def root(tmp_path):
     for number in range(10):
         write(tmp_path, f"03001627/chair{number}", seed=number)
     write(tmp_path, "03211117/display0")
-    store.write_lists(tmp_path, seed=0)
+    tree_files.write_lists(tmp_path, seed=0)
     return tmp_path
 
 
 def test_round_trip(tmp_path):
     written, points = write(tmp_path, "03001627/one")
-    store.write_lists(tmp_path, seed=0)
-    shape = next(s for split in store.SPLITS for s in ShapeTree(tmp_path, split).iter_valid())
+    tree_files.write_lists(tmp_path, seed=0)
+    shape = next(s for split in tree_files.SPLITS for s in ShapeTree(tmp_path, split).iter_valid())
     assert (shape.id, shape.category) == ("03001627/one", "chair")
     np.testing.assert_array_equal((shape.images.numpy() * 255).round(), written.images.transpose(0, 3, 1, 2))
     np.testing.assert_array_equal(np.isfinite(shape.depth.numpy()), np.isfinite(written.depth))
@@ -55,66 +55,68 @@ def test_a_shape_appears_complete_or_not_at_all(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr(store, "write_points", fail)
+    monkeypatch.setattr(tree_files, "write_points", fail)
     with pytest.raises(OSError, match="disk full"):
         write(tmp_path, "03001627/one")
-    assert not store.is_written(tmp_path, "03001627/one")
-    assert list((tmp_path / store.RENDERS / "03001627").iterdir()) == []
+    assert not tree_files.is_written(tmp_path, "03001627/one")
+    assert list((tmp_path / tree_files.RENDERS / "03001627").iterdir()) == []
 
 
 def test_leftovers_of_a_killed_run_are_cleared_and_never_listed(tmp_path):
-    store.claim(tmp_path / "data", {"size": SIZE})
+    tree_files.prepare_output(tmp_path / "data", {"size": SIZE})
     write(tmp_path / "data", "03001627/one")
-    leftover = tmp_path / "data" / store.RENDERS / "03001627" / ".writing-x"
+    leftover = tmp_path / "data" / tree_files.RENDERS / "03001627" / ".writing-x"
     leftover.mkdir()
-    assert store.write_lists(tmp_path / "data", seed=0)["train"].keys() == {"03001627"}
-    assert sum(len(ShapeTree(tmp_path / "data", split)) for split in store.SPLITS) == 1
-    store.claim(tmp_path / "data", {"size": SIZE})
+    assert tree_files.write_lists(tmp_path / "data", seed=0)["train"].keys() == {"03001627"}
+    assert sum(len(ShapeTree(tmp_path / "data", split)) for split in tree_files.SPLITS) == 1
+    tree_files.prepare_output(tmp_path / "data", {"size": SIZE})
     assert not leftover.exists()
 
 
 def test_other_settings_or_a_foreign_folder_are_refused(tmp_path):
-    store.claim(tmp_path / "data", {"size": SIZE})
-    with pytest.raises(UserError, match="size 16 there, 32 now"):
-        store.claim(tmp_path / "data", {"size": 32})
+    tree_files.prepare_output(tmp_path / "data", {"size": SIZE})
+    with pytest.raises(UserError, match="size: 16 there, 32 now"):
+        tree_files.prepare_output(tmp_path / "data", {"size": 32})
     (tmp_path / "data" / "made_with.json").write_text("{")
     with pytest.raises(UserError, match="cannot be read"):
-        store.claim(tmp_path / "data", {"size": SIZE})
+        tree_files.prepare_output(tmp_path / "data", {"size": SIZE})
     (tmp_path / "file").touch()
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(UserError, match="choose"):
-            store.claim(out, {"size": SIZE})
+            tree_files.prepare_output(out, {"size": SIZE})
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").touch()
     with pytest.raises(UserError, match="no dataset"):
-        store.claim(tmp_path / "mine", {"size": SIZE})
+        tree_files.prepare_output(tmp_path / "mine", {"size": SIZE})
 
 
 @pytest.mark.parametrize("count", [5, 6, 12])
 def test_split_leaves_no_part_empty(count):
     for seed in range(30):
-        split_of = store.split_shapes([f"03001627/m{i}" for i in range(count)], seed=seed)
-        assert set(split_of.values()) == set(store.SPLITS)
+        split_of = tree_files.split_shapes([f"03001627/m{i}" for i in range(count)], seed=seed)
+        assert set(split_of.values()) == set(tree_files.SPLITS)
 
 
 def test_split_has_its_shares_is_seeded_and_stays_when_shapes_are_added():
     shapes = [f"03001627/m{i}" for i in range(2000)]
-    split_of = store.split_shapes(shapes, seed=0)
-    shares = {split: list(split_of.values()).count(split) / 2000 for split in store.SPLITS}
+    split_of = tree_files.split_shapes(shapes, seed=0)
+    shares = {split: list(split_of.values()).count(split) / 2000 for split in tree_files.SPLITS}
     assert shares == pytest.approx({"train": 0.7, "val": 0.1, "test": 0.2}, abs=0.03)
-    assert store.split_shapes(shapes[:1000], seed=0) == {shape: split_of[shape] for shape in shapes[:1000]}
-    assert store.split_shapes(shapes, seed=1) != split_of
+    assert tree_files.split_shapes(shapes[:1000], seed=0) == {
+        shape: split_of[shape] for shape in shapes[:1000]
+    }
+    assert tree_files.split_shapes(shapes, seed=1) != split_of
 
 
 def test_hidden_variants_of_one_object_stay_in_one_split():
-    split_of = store.split_shapes([f"03001627/m{i}_h{k}" for i in range(50) for k in range(3)], seed=0)
+    split_of = tree_files.split_shapes([f"03001627/m{i}_h{k}" for i in range(50) for k in range(3)], seed=0)
     for i in range(50):
         assert len({split_of[f"03001627/m{i}_h{k}"] for k in range(3)}) == 1
 
 
 def test_categories_by_name_and_synset(root):
     for categories in (["display"], ["03211117"]):
-        assert sum(len(ShapeTree(root, split, categories)) for split in store.SPLITS) == 1
+        assert sum(len(ShapeTree(root, split, categories)) for split in tree_files.SPLITS) == 1
     with pytest.raises(UserError, match=r"no category 'hat'.*it has: chair, display"):
         ShapeTree(root, "train", ["hat"])
 
@@ -151,7 +153,11 @@ def test_a_broken_file_is_named_and_skipped(root, breakage):
     name, damage = BREAKAGES[breakage]
     whole = len(ShapeTree(root).load_all(progress=False))
     victim = ShapeTree(root).ids[1]
-    file = store.cloud_file(root, victim) if name == "ply" else store.render_folder(root, victim) / name
+    file = (
+        tree_files.cloud_file(root, victim)
+        if name == "ply"
+        else tree_files.render_folder(root, victim) / name
+    )
     damage(file)
     tree = ShapeTree(root)
     assert len(tree.load_all(progress=False)) == whole - 1
@@ -166,8 +172,10 @@ def test_a_broken_file_is_named_and_skipped(root, breakage):
 def test_views_of_different_sizes_are_no_shape(root):
     victim = ShapeTree(root).ids[0]
     other = root / "other"
-    store.write_shape(other, "a/b", Views(*_flat_views(8)), np.zeros((3, 3)))
-    shutil.copy(other / store.RENDERS / "a/b/depth_0.png", store.render_folder(root, victim) / "depth_0.png")
+    tree_files.write_shape(other, "a/b", Views(*_flat_views(8)), np.zeros((3, 3)))
+    shutil.copy(
+        other / tree_files.RENDERS / "a/b/depth_0.png", tree_files.render_folder(root, victim) / "depth_0.png"
+    )
     with pytest.raises(ShapeError, match="pictures of view 0"):
         ShapeTree(root)[0]
 
@@ -180,7 +188,7 @@ def _flat_views(size):
 def test_the_release_s_camera_files_are_read(root):
     shape = ShapeTree(root)[0]
     for i in range(2):
-        file = store.render_folder(root, shape.id) / f"camera_{i}.json"
+        file = tree_files.render_folder(root, shape.id) / f"camera_{i}.json"
         record = json.loads(file.read_text())
         file.unlink()
         extrinsic = np.array(record["cam_from_world"])[:3]
@@ -193,5 +201,5 @@ def test_the_release_s_camera_files_are_read(root):
 def test_a_text_ply_is_read(root):
     shape = ShapeTree(root)[0]
     cloud = trimesh.PointCloud(np.eye(3))
-    cloud.export(store.cloud_file(root, shape.id), encoding="ascii")
+    cloud.export(tree_files.cloud_file(root, shape.id), encoding="ascii")
     np.testing.assert_array_equal(ShapeTree(root)[0].points, np.eye(3))

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from diffpoint import PinholeCamera
-from train.data.rules import Hider
+from train.data.ambiguity_check import AmbiguousObject
 from train.experiments.correlation import correlation, over_shapes, pearson, spearman, within_shapes
 from train.experiments.coverage import coverage, hidden_distances, make_object, near_distance, reach
 from train.experiments.predictions import predictions, spread
@@ -106,7 +106,7 @@ def test_coverage_is_measured_and_drawn(bench: Workbench) -> None:
 
 
 def test_the_backs_themselves_cover_all_backs() -> None:
-    obj = make_object(Hider("loudspeaker", (0, 2)), 64)
+    obj = make_object(AmbiguousObject("loudspeaker", (0, 2)), 64)
     near = near_distance(obj.backs, obj.again)
     assert reach(hidden_distances(obj.backs, obj.backs), near) == (1, 0)
     assert reach(hidden_distances(obj.again[:, :1024].contiguous(), obj.backs), near) == (1, 0)
@@ -116,7 +116,7 @@ def test_the_backs_themselves_cover_all_backs() -> None:
 
 
 def test_what_is_none_of_the_backs_is_told() -> None:
-    obj = make_object(Hider("loudspeaker", (0, 2)), 64)
+    obj = make_object(AmbiguousObject("loudspeaker", (0, 2)), 64)
     near = near_distance(obj.backs, obj.again)
     beyond = obj.backs[2:].clone()
     beyond[..., 2] -= 0.4 * (beyond[..., 2] < 0)  # twice as deep as the deepest

@@ -23,7 +23,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from train.config import FitConfig, Profile, fit_config_from_json, renamed_options, with_steps
 from train.data_commands import Data
 from train.errors import UserError
-from train.experiments.registry import ABOUT_ALL, QUESTIONS
+from train.experiments.registry import ABOUT_ALL, EXPERIMENTS
 from train.methods import METHODS, recipe
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
@@ -154,12 +154,14 @@ class Evaluate:
         )
 
 
-def _questions() -> str:
-    everything = {**QUESTIONS, **ABOUT_ALL}.items()
-    lines = "\n\n".join(f"{name}: {words}{'' if words[-1] in '?)' else '.'}" for name, words in everything)
-    return f"""Answer one question by measurement; writes NAME.json, NAME.md and NAME.png into --out.
+def _about_experiments() -> str:
+    everything = {name: entry.description for name, entry in EXPERIMENTS.items()} | ABOUT_ALL
+    lines = "\n\n".join(
+        f"{name}: {words}{'' if words[-1] in '?)' else '.'}" for name, words in everything.items()
+    )
+    return f"""Run one experiment; writes NAME.json, NAME.md and NAME.png into --out.
 
-    Trains what it needs, once for all experiments that write to the same place, and goes on where it was stopped.
+    Trains what it needs, once for all experiments that write to the same place; a stopped experiment continues.
 
     {lines.replace(chr(10), chr(10) + "    ")}
 
@@ -175,7 +177,7 @@ class Experiment:
         PrimitiveConstructorSpec(
             nargs=1,
             metavar="NAME",
-            choices=tuple(QUESTIONS | ABOUT_ALL),
+            choices=(*EXPERIMENTS, *ABOUT_ALL),
             instance_from_str=lambda words: words[0],
             is_instance=lambda value: isinstance(value, str),
             str_from_instance=lambda value: [value],
@@ -185,7 +187,7 @@ class Experiment:
     out: Path
     """Directory to write to."""
     data: tuple[Path, ...] = ()
-    """Root of a data tree; several are put together for training, and the first one's test split is scored (health:
+    """Root of a data tree; several are put together for training, and the first one's test split is measured (collapse:
     each on its own)."""
     profile: Literal["full", "cpu", "smoke"] = "cpu"
     """Size of the networks, and how they are trained."""
@@ -207,24 +209,24 @@ class Experiment:
     """agreement: views per shape."""
 
     def run(self) -> None:
-        from train.experiments.run import Workbench, run_all, run_experiment, show_all, write_page
+        from train.experiments.run import Study, print_status, run_all, run_experiment, write_page
 
         processes = os.cpu_count() or 1 if self.processes is None else self.processes
-        bench = Workbench(
-            self.data, self.out, self.profile, self.seeds, self.limit, self.steps,
-            processes=processes, category=self.category, pictures=self.pictures,
+        study = Study(
+            self.data, self.out, self.profile, self.seeds, self.limit, self.steps, processes=processes,
+            category=self.category, pictures=self.pictures, run=self.run_, views=self.views,
         )  # fmt: skip
         if self.name == "list":
-            show_all(bench)
+            print_status(study)
         elif self.name == "all":
-            run_all(bench)
+            run_all(study)
         elif self.name == "page":
             print(f"wrote {write_page(self.out)}")
         else:
-            run_experiment(self.name, bench, run=self.run_, views=self.views)
+            run_experiment(self.name, study)
 
 
-Experiment.__doc__ = _questions()
+Experiment.__doc__ = _about_experiments()
 
 
 @dataclasses.dataclass

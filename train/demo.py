@@ -11,7 +11,7 @@ from pathlib import Path
 from train.config import FitConfig, scaled
 from train.data import ShapeTree
 from train.data.procedural import generate
-from train.data.store import render_folder
+from train.data.tree_files import render_folder
 from train.evaluation.evaluate import evaluate
 from train.evaluation.reconstruct import reconstruct_to_files
 from train.evaluation.report import write_report

@@ -12,11 +12,11 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
-from multiprocessing.pool import ExceptionWithTraceback
 from types import FrameType
 from typing import Any, Literal, TypeVar
 
@@ -110,7 +110,7 @@ def _results(
     on_crash: Literal["stop", "return"],
     title: str,
 ) -> Iterator[tuple[int, Any]]:
-    """Yields (number of the call, result) as calls finish. A worker has one call at a time, so none waits in a queue."""
+    """Yields (number of the call, result) as calls finish. A worker has one call at a time; none waits in a queue."""
     waiting = deque(enumerate(calls))
     idle: list[_Worker] = []
     busy: dict[Connection, tuple[_Worker, int]] = {}
@@ -178,7 +178,10 @@ class _Worker:
 
     def receive(self) -> tuple[bool, Any]:
         """(True, result) or (False, exception) of the call."""
-        return pickle.loads(self.connection.recv_bytes())
+        succeeded, result, trace = pickle.loads(self.connection.recv_bytes())
+        if not succeeded:
+            result.__cause__ = RuntimeError(f"in a worker process:\n{trace}")
+        return succeeded, result
 
     def terminate(self) -> None:
         """Sends SIGTERM."""
@@ -204,18 +207,19 @@ def _serve(connection: Connection) -> None:
                 function, call = pickle.loads(message)
                 if first:
                     _use_one_thread()
-                first, answer = False, pickle.dumps((True, function(*call)))
+                first, answer = False, pickle.dumps((True, function(*call), None))
             except BaseException as error:
                 answer = _pickled_error(error)
             connection.send_bytes(answer)
 
 
 def _pickled_error(error: BaseException) -> bytes:
+    trace = "".join(traceback.format_exception(type(error), error, error.__traceback__))
     try:
-        message = pickle.dumps((False, ExceptionWithTraceback(error, error.__traceback__)))
+        message = pickle.dumps((False, error, trace))
         pickle.loads(message)
     except Exception:  # some exceptions cannot be pickled
-        return pickle.dumps((False, RuntimeError(f"{type(error).__name__}: {error}")))
+        return pickle.dumps((False, RuntimeError(f"{type(error).__name__}: {error}"), trace))
     return message
 
 

@@ -1,8 +1,8 @@
 """A split of the data, ready for the network, and the sampler that draws batches from it.
 
 Images are kept as bytes at the network's input size; depth maps at the size at which the front constraint
-compares, with cameras that fit the smaller maps exactly, so that prediction and observation are made with one
-camera. Both are mapped from files (train/data/cache.py): a batch touches the pages of its own views.
+compares, with cameras that fit the smaller maps exactly, so that prediction and observation share one camera. Both are
+mapped from files (train/data/cache.py): a batch reads the pages of its own views.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from diffpoint import PinholeCamera
-from train.data import ShapeTree
 from train.data.cache import prepare
-from train.data.shrink import Pool, Sizes, SmallShape
+from train.data.shape import Shape
+from train.data.shrink import Pool, Sizes
+from train.data.tree import ShapeTree
 from train.errors import UserError
 
 
@@ -77,7 +78,7 @@ class LoadedSplit:
         return Batch(self.float_images(shapes, views), _picked(self.depth, shapes, views), camera)
 
     def targets(self, shapes: Tensor) -> Targets:
-        """(B,) shape numbers -> their targets: clouds, and all views."""
+        """(B,) shape numbers -> their whole surfaces and all of their views."""
         seen = self.batch(shapes, torch.arange(self.views).expand(len(shapes), -1))
         return Targets(self.points[shapes], seen.depth, seen.camera)
 
@@ -92,7 +93,7 @@ def _picked(values: Sequence[Tensor] | Tensor, shapes: Tensor, views: Tensor) ->
 
 
 class Targets(NamedTuple):
-    """What B shapes really are: their surface, and all V views that the data have of them.
+    """The ground truth of B shapes: points on the whole surface, and all V views that the data have.
 
     Attributes:
         points: (B, P, 3) on the surface, world frame.
@@ -114,7 +115,7 @@ class Batch(NamedTuple):
         camera: (B, V), of the depth maps.
         real: (K, B, N, 3) ground truth clouds for the critic, first those of the B shapes, then of others; None
             without a critic.
-        targets: of the same shapes, for methods whose losses need more than the depth maps of the batch; else None.
+        targets: the same shapes, for methods that learn from more than the images' own depth maps; else None.
     """
 
     images: Tensor
@@ -125,7 +126,7 @@ class Batch(NamedTuple):
 
 
 def load_split(
-    data: Path | Sequence[Path],
+    data: str | Path | Sequence[str | Path],
     split: Literal["train", "val", "test"],
     *,
     image_size: tuple[int, int],
@@ -135,9 +136,9 @@ def load_split(
     limit: int | None = None,
     progress: bool = True,
 ) -> LoadedSplit:
-    """Opens a split of one or more data trees; broken shapes are named and left out.
+    """Opens a split of one or more data trees; broken shapes are named on stderr and left out.
 
-    The first time, its pictures are decoded and kept small; see train/data/cache.py.
+    The first time, its pictures are decoded, and what is made of them is kept; see train/data/cache.py.
 
     Args:
         data: root of the tree, or of each.
@@ -156,12 +157,12 @@ def load_split(
     if limit is not None:
         _thin_out(trees, limit)
     sizes = Sizes(image_size, map_size, gt_pool)
-    shapes: list[SmallShape] = []
+    shapes: list[Shape] = []
     for tree in trees:
         prepared = prepare(tree.path, tree.ids, sizes, name=split, progress=progress)
         for name in tree.ids:
             small = prepared[name]
-            if isinstance(small, SmallShape):
+            if isinstance(small, Shape):
                 shapes.append(small)
             else:
                 tree.skipped[name] = str(small)
@@ -175,16 +176,16 @@ def load_split(
     return LoadedSplit(
         images=[shape.images for shape in shapes],
         depth=[shape.depth for shape in shapes],
-        K=torch.stack([shape.K for shape in shapes]),
-        cam_from_world=torch.stack([shape.cam_from_world for shape in shapes]),
+        K=torch.stack([shape.camera.K for shape in shapes]),
+        cam_from_world=torch.stack([shape.camera.cam_from_world for shape in shapes]),
         points=torch.stack([shape.points for shape in shapes]),
         ids=[shape.id for shape in shapes],
         categories=[shape.category for shape in shapes],
     )
 
 
-def _roots(data: Path | Sequence[Path]) -> list[Path]:
-    return [data] if isinstance(data, Path) else list(data)
+def _roots(data: str | Path | Sequence[str | Path]) -> list[Path]:
+    return [Path(root) for root in ([data] if isinstance(data, str | Path) else data)]
 
 
 def _thin_out(trees: Sequence[ShapeTree], limit: int) -> None:
@@ -199,7 +200,7 @@ def _thin_out(trees: Sequence[ShapeTree], limit: int) -> None:
         start += len(ids)
 
 
-def _of_the_usual_size(shapes: list[SmallShape], skipped: dict[str, str]) -> list[SmallShape]:
+def _of_the_usual_size(shapes: list[Shape], skipped: dict[str, str]) -> list[Shape]:
     """Keeps the shapes with the most common numbers of views and points; names the others in `skipped`."""
     if not shapes:
         return shapes

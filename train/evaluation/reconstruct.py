@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffpoint.io import write_points
-from train.data.choy import pictures_of
+from train.data.choy_layout import pictures_of
 from train.data.cutout import cut_out
 from train.data.images import is_cut_out, read_images, read_rgba
 from train.errors import UserError

@@ -23,7 +23,6 @@ from train.evaluation.runs import load_autoencoder
 from train.experiments.store import Metrics
 from train.experiments.study import Study
 from train.experiments.table import Row
-from train.methods.systems import cloud_size
 
 _PREDICTIONS = 10
 _NEAREST_AMONG = 300
@@ -45,7 +44,7 @@ def ten_predictions(row: Row, study: Study, config: FitConfig) -> Metrics:
         the nearest training shape; and for rows with `critic_of` "critic", see `below_real_shapes`. Diversity alone
         does not distinguish other shapes from noise; the others do.
     """
-    points, train = cloud_size(config), study.split(config, "train")
+    points, train = get_method(config.system).cloud_size(config), study.split(config, "train")
     some = torch.linspace(0, len(train) - 1, min(_NEAREST_AMONG, len(train))).long()
 
     def distances(source: Source, test: LoadedSplit) -> Metrics:
@@ -82,7 +81,7 @@ def _measure(
 ) -> Metrics:
     """A measurement of the predictions of a row's network; or of samples of the ground truth in their place."""
     if row.source == "truth":
-        test, points = study.split(config, "test"), cloud_size(config)
+        test, points = study.split(config, "test"), get_method(config.system).cloud_size(config)
         source = functools.partial(_samples, points=points, seed=config.seed)
         key = [f"{name} of samples", config.seed, points, test.fingerprint, *inputs]
         return study.kept(key, lambda: function(source, test))

@@ -19,7 +19,7 @@ from train.evaluation.runs import read_metrics
 from train.experiments.statistics import spread
 from train.experiments.store import Metrics
 from train.experiments.study import Study
-from train.methods.systems import size_of
+from train.methods import get_method
 from train.training.trainer import STAGES
 from train.training.validation import validate
 
@@ -227,7 +227,7 @@ def _floor(study: Study) -> dict[str, float]:
     """The metrics of as many points of the true surface as a network predicts."""
     config = configs(study)[0]
     test = study.split(config, "test")
-    count = size_of(config).points
+    count = get_method(config.system).network_config(config).points
     generator = torch.Generator().manual_seed(0)
     some = torch.stack([torch.randperm(test.points.shape[1], generator=generator)[:count] for _ in test.ids])
     found = [

@@ -18,8 +18,8 @@ from tqdm import tqdm
 
 from train.config import FitConfig
 from train.data import ShapeTree
+from train.data.ambiguity_check import ambiguous_object
 from train.data.categories import SYNSET_OF
-from train.data.rules import hider_of
 from train.errors import UserError
 from train.evaluation.inference import reconstruct
 from train.evaluation.metrics import cloud_errors
@@ -108,7 +108,7 @@ def _check(study: Study) -> None:
             f"no chairs to train on in {', '.join(map(str, study.data))}; make some with: python -m train data "
             "procedural --out DIR"
         )
-    if any(hider and hider.seed[0] == SEED for hider in map(hider_of, trained)):
+    if any(hider and hider.seed[0] == SEED for hider in map(ambiguous_object, trained)):
         raise UserError(
             f"a tree was made with --seed {SEED}, which this experiment reserves for chairs that no network has seen; "
             "make it with another seed"

@@ -1,4 +1,4 @@
-"""Finding meshes in folders, archives and single files, and what to call them."""
+"""Finding meshes in folders, archives and single files; their categories and names."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ import numpy as np
 
 from train.data.archives import ARCHIVE_SUFFIXES, Rotation, catalogue_rotations, is_library, unpack
 from train.data.categories import SYNSET_OF, UNKNOWN, synset_of
-from train.data.store import CLOUDS
+from train.data.tree_files import CLOUDS
 from train.errors import UserError
 
 MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".off", ".stl")
-_NO_NAMES = {"model", "models", "model_normalized", "mesh", "meshes", "object"}
+_GENERAL_NAMES = {"model", "models", "model_normalized", "mesh", "meshes", "object"}
 _NOT_A_MODEL = re.compile(rf"(^|/)(\.|__MACOSX/|{CLOUDS}/)")
-"""Hidden files, the shadow files of macOS archives, and the clouds of a dataset made below the source."""
+"""Hidden files, the resource forks in macOS archives, and the clouds of a dataset made below the source."""
 
 _SYNSET = re.compile(r"[01]\d{7}")  # WordNet's offsets; a folder that is a date starts with 2
 
@@ -34,7 +34,7 @@ UPRIGHT: dict[str, Rotation | None] = {
     "-z": (1, 0, 0, 0, 0, -1, 0, 1, 0),
     "-x": (0, 1, 0, -1, 0, 0, 0, 0, 1),
 }
-"""What stands a model upright, by the axis that points up in its file. With z up, its front is taken to be at -y."""
+"""Rotations to y up, by the axis that points up in the file. With z up, the front is assumed to be at -y."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ class MeshFile:
         library: name of the folder or archive it came from.
         inside: path inside the library, with forward slashes.
         synset: folder name of its category.
-        rotation: 9 numbers, row by row, that stand the model upright and facing +z; None for as it is.
+        rotation: 9 numbers, row by row, that turn the model upright and its front to +z; None for none.
     """
 
     path: Path
@@ -57,36 +57,36 @@ class MeshFile:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return f"{self.library}: {self.inside}"
 
     @property
     def root(self) -> Path:
-        """The folder that holds all it may need: its library's, and at least the one above its own."""
+        """The folder below which its materials and textures may be: its library's, at least the parent of its own."""
         parents = self.path.resolve().parents
         return parents[min(max(len(PurePosixPath(self.inside).parts) - 1, 1), len(parents) - 1)]
 
 
 @dataclasses.dataclass(frozen=True)
 class Label:
-    """A line of a label file: which model of which library is what."""
+    """A line of a label file: the category of a model in a library."""
 
     library: str
     model: str
     synset: str
     turn: Rotation | None = None
-    """What stands the model upright and facing +z where its library's own rotation does not."""
+    """Turns the model upright and its front to +z where its library's own rotation does not."""
 
 
 def find_meshes(
-    sources: Sequence[Path], scratch: Path, *, up: str = "y"
+    sources: Sequence[str | Path], scratch: str | Path, *, up: str = "y"
 ) -> tuple[list[MeshFile], dict[str, str]]:
     """All meshes of the sources; archives are unpacked below `scratch`.
 
     Args:
         sources: folders, archives and mesh files.
         scratch: a folder for what is unpacked; it must outlive the meshes.
-        up: the axis that points up in the files, a key of `UPRIGHT`. A Sweet Home 3D library says so itself.
+        up: the axis that points up in the files, a key of `UPRIGHT`; not used for Sweet Home 3D libraries.
 
     Returns:
         The meshes, and by name the archive members that were refused.
@@ -96,7 +96,8 @@ def find_meshes(
     """
     meshes: list[MeshFile] = []
     refused: dict[str, str] = {}
-    for source in {source.resolve(): source for source in sources}.values():
+    scratch = Path(scratch)
+    for source in {path.resolve(): path for path in map(Path, sources)}.values():
         if not source.exists():
             raise UserError(f"no such file or folder: {source}")
         if source.is_dir():
@@ -117,7 +118,7 @@ def find_meshes(
             archives = []
         else:
             known = ", ".join(ARCHIVE_SUFFIXES + MESH_SUFFIXES)
-            raise UserError(f"{source} is no folder and none of {known}")
+            raise UserError(f"{source} is neither a folder nor one of {known}")
         for archive in archives:
             folder = scratch / str(len(list(scratch.iterdir())))
             refused |= unpack(archive, folder)
@@ -140,7 +141,7 @@ def _in_folder(
 
 
 def _synset_from(parts: Iterable[str]) -> str:
-    """The category that a folder on the way is named after (by name, plural or synset), the innermost first."""
+    """The category after which a folder of the path is named (name, plural or synset); the innermost folder counts."""
     for part in reversed(tuple(parts)):
         if _SYNSET.fullmatch(part):
             return part
@@ -150,17 +151,18 @@ def _synset_from(parts: Iterable[str]) -> str:
     return UNKNOWN
 
 
-def read_labels(path: Path) -> list[Label]:
-    """Read a label file with the columns model and category, and where wanted library, synset and turn.
+def read_labels(path: str | Path) -> list[Label]:
+    """Reads a label file with the columns model and category, and optionally library, synset and turn.
 
-    A model is a path inside its library, which is a source folder or archive by name; without one, inside any.
+    A model is a path inside its library, which is the name of a source folder or archive; without one, inside any.
 
     A turn is an axis and the degrees by which a model is turned about it, after its library's own rotation: with `x90`
     a telephone that lies on its back stands up and faces +z.
 
     Raises:
-        UserError: no such file, no such columns, or a turn that is none.
+        UserError: no such file, no such columns, or a turn of another form.
     """
+    path = Path(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
@@ -186,7 +188,7 @@ def _turn_of(text: str, where: str) -> Rotation | None:
         return None
     parts = re.fullmatch(r"([xyz])(-?\d+)", text.strip())
     if parts is None:
-        raise UserError(f"{where}: the turn {text!r} is no axis and degrees such as y90")
+        raise UserError(f"{where}: the turn {text!r} is not an axis and degrees, such as y90")
     angle = math.radians(int(parts[2]))
     first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[parts[1]]
     matrix = np.eye(3)
@@ -197,16 +199,16 @@ def _turn_of(text: str, where: str) -> Rotation | None:
 
 
 def _followed_by(rotation: Rotation | None, turn: Rotation | None) -> Rotation | None:
-    """Both, one after the other, as one."""
+    """The rotation that is `rotation` followed by `turn`."""
     if rotation is None or turn is None:
         return rotation or turn
     return tuple((np.reshape(turn, (3, 3)) @ np.reshape(rotation, (3, 3))).ravel().tolist())
 
 
 def keep_labelled(
-    meshes: Sequence[MeshFile], labels: Sequence[Label], path: Path
+    meshes: Sequence[MeshFile], labels: Sequence[Label], path: str | Path
 ) -> tuple[list[MeshFile], dict[str, str]]:
-    """The meshes that have a label, with its category; and by name the labelled ones that their library lacks.
+    """The meshes that have a label, with its category; and reasons by the name of labelled ones that do not exist.
 
     Raises:
         UserError: no label fits any mesh.
@@ -223,19 +225,19 @@ def keep_labelled(
             turned = _followed_by(mesh.rotation, label.turn)
             kept.append(dataclasses.replace(mesh, synset=label.synset, rotation=turned))
         if not found and label.library in libraries | {""}:
-            absent[f"{label.library or path.name}: {label.model}"] = (
-                "the label file names it, its library does not have it"
+            absent[f"{label.library or Path(path).name}: {label.model}"] = (
+                "the label file names it, but its library does not contain it"
             )
     if not kept:
         raise UserError(
-            f"no line of {path} fits the meshes: it speaks of {_some({label.library for label in labels})}, "
+            f"no line of {path} fits the meshes: its libraries are {_some({label.library for label in labels})}, "
             f"the sources are {_some(libraries)}"
         )
     return kept, absent
 
 
 def of_category(meshes: Sequence[MeshFile], category: str) -> list[MeshFile]:
-    """The meshes, all of one category: a name of the paper's, a synset, or a name of one's own."""
+    """The meshes, all with one category: a name of the paper's, a synset, or any other name."""
     synset = _synset_from([category])
     synset = synset_of(category) if synset == UNKNOWN else synset
     return [dataclasses.replace(mesh, synset=synset) for mesh in meshes]
@@ -246,10 +248,10 @@ def _some(names: set[str]) -> str:
 
 
 def shape_ids(meshes: Sequence[MeshFile]) -> list[str]:
-    """A name "synset/model" for each mesh: unique, safe on every file system, and the same in the next run.
+    """A name "synset/model" for each mesh: unique, valid on every file system, and the same in the next run.
 
-    The model is named after its path without what says nothing; where that is not plain ASCII, or two meshes would
-    share the name, a hash of the library and the whole path follows.
+    The model is named after its path without general words such as "model.obj"; where that is not plain ASCII, or two
+    meshes would share the name, a hash of the library and the whole path follows.
     """
     plain = [_plain_name(mesh) for mesh in meshes]
     uses = Counter(f"{mesh.synset}/{name.lower()}" for mesh, (name, _) in zip(meshes, plain, strict=True))
@@ -266,9 +268,9 @@ def shape_ids(meshes: Sequence[MeshFile]) -> list[str]:
 
 
 def _plain_name(mesh: MeshFile) -> tuple[str, bool]:
-    """A name of safe characters, and whether nothing was lost on the way to it."""
+    """A name of safe characters, and whether it still has all characters of the path."""
     parts = list(PurePosixPath(mesh.inside).with_suffix("").parts)
-    while len(parts) > 1 and (parts[-1].lower() in _NO_NAMES or parts[-1] == parts[-2]):
+    while len(parts) > 1 and (parts[-1].lower() in _GENERAL_NAMES or parts[-1] == parts[-2]):
         parts.pop()
     if len(parts) > 1 and _synset_from(parts[:1]) == mesh.synset:
         parts = parts[1:]

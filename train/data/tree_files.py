@@ -1,4 +1,4 @@
-"""The dataset on disk: the tree of the paper's release, written one whole shape at a time.
+"""The files of a data tree, laid out as in the paper's release: where they are, and how they are written.
 
     rendered-shapenet/<synset>/<model>/{render_i.png, depth_i.png, camera_i.json}
     pcdata_2048/<synset>/<model>.ply
@@ -11,10 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
-import shutil
-import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from pathlib import Path
@@ -26,46 +23,50 @@ import torch
 from diffpoint.io import encode_depth, write_points
 from train.data.render import Views
 from train.errors import UserError
-from train.files import write_text
+from train.files import remove, replacing, write_text
 
 RENDERS, CLOUDS, LISTS = "rendered-shapenet", "pcdata_2048", "data_list"
 SPLITS = ("train", "val", "test")
 POINTS = 2048
 _SHARES = {"test": 0.2, "val": 0.1}
-_SETTINGS = "made_with.json"
+SETTINGS = "made_with.json"
+"""Holds the settings of the command that made the tree; trees from elsewhere lack it."""
 
 
-def render_folder(root: Path, shape: str) -> Path:
-    """Where the views of the shape "<synset>/<model>" live."""
-    return root / RENDERS / shape
+def render_folder(root: str | Path, shape: str) -> Path:
+    """The folder with the views of the shape "<synset>/<model>"."""
+    return Path(root) / RENDERS / shape
 
 
-def cloud_file(root: Path, shape: str) -> Path:
-    """Where the ground-truth cloud of the shape "<synset>/<model>" lives."""
-    return root / CLOUDS / f"{shape}.ply"
+def cloud_file(root: str | Path, shape: str) -> Path:
+    """The file with the ground-truth cloud of the shape "<synset>/<model>"."""
+    return Path(root) / CLOUDS / f"{shape}.ply"
 
 
-def is_written(root: Path, shape: str) -> bool:
+def is_written(root: str | Path, shape: str) -> bool:
     """True if an earlier run finished this shape."""
     return render_folder(root, shape).is_dir() and cloud_file(root, shape).is_file()
 
 
-def write_shape(root: Path, shape: str, views: Views, points: np.ndarray) -> None:
-    """Write one shape so that its folder appears complete or not at all, whenever the process dies.
+def is_own(root: str | Path) -> bool:
+    """True for a tree that this program made."""
+    return (Path(root) / SETTINGS).is_file()
 
-    The cloud goes first and the folder of views is renamed into place last: the folder there means "finished".
+
+def write_shape(root: str | Path, shape: str, views: Views, points: np.ndarray) -> None:
+    """Writes one shape. Its folder of views appears complete or not at all, whenever the process is killed.
+
+    The cloud is written first and the folder is renamed into place last: a folder means "finished".
     """
     target, cloud = render_folder(root, shape), cloud_file(root, shape)
-    target.parent.mkdir(parents=True, exist_ok=True)
     cloud.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=".writing-", dir=target.parent))
-    try:
-        scratch.chmod(0o755)
+    with replacing(target) as folder:
+        folder.mkdir()
         K, cam_from_world = views.camera.K.tolist(), views.camera.cam_from_world.tolist()
         for i, (image, depth) in enumerate(zip(views.images, views.depth, strict=True)):
-            imageio.imwrite(scratch / f"render_{i}.png", image, compress_level=3)
+            imageio.imwrite(folder / f"render_{i}.png", image, compress_level=3)
             imageio.imwrite(
-                scratch / f"depth_{i}.png", encode_depth(torch.from_numpy(depth)), compress_level=3
+                folder / f"depth_{i}.png", encode_depth(torch.from_numpy(depth)), compress_level=3
             )
             record = {
                 "K": K[i],
@@ -73,17 +74,13 @@ def write_shape(root: Path, shape: str, views: Views, points: np.ndarray) -> Non
                 "height": views.camera.height,
                 "width": views.camera.width,
             }
-            (scratch / f"camera_{i}.json").write_text(json.dumps(record))
+            (folder / f"camera_{i}.json").write_text(json.dumps(record))
         write_points(cloud, torch.from_numpy(points.astype(np.float32)))
-        if target.exists():
-            shutil.rmtree(target)
-        os.replace(scratch, target)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        remove(target)
 
 
-def write_lists(root: Path, *, seed: int) -> dict[str, dict[str, int]]:
-    """Split what is on disk into train, val and test (about 70/10/20) and write the lists.
+def write_lists(root: str | Path, *, seed: int) -> dict[str, dict[str, int]]:
+    """Splits the shapes on disk into train, val and test (about 70/10/20) and writes the lists.
 
     The split depends on the seed and the shape's own name, so that it stays when shapes are added. Hidden
     variants of one object, named `<object>_h<k>`, stay together. From five objects on, each category has at least
@@ -92,6 +89,7 @@ def write_lists(root: Path, *, seed: int) -> dict[str, dict[str, int]]:
     Returns:
         Counts, by split and synset.
     """
+    root = Path(root)
     shapes_by_synset: dict[str, list[str]] = defaultdict(list)
     for folder in sorted((root / RENDERS).glob("*/*")):
         shape = f"{folder.parent.name}/{folder.name}"
@@ -103,9 +101,7 @@ def write_lists(root: Path, *, seed: int) -> dict[str, dict[str, int]]:
         for split in SPLITS:
             lines = [shape for shape in shapes if split_of[shape] == split]
             counts[split][synset] = len(lines)
-            path = root / LISTS / split / f"{synset}.list"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_text(path, "".join(f"{line}\n" for line in lines))
+            write_text(root / LISTS / split / f"{synset}.list", "".join(f"{line}\n" for line in lines))
     return counts
 
 
@@ -133,13 +129,14 @@ def _split_at(fraction: float) -> str:
     return "val" if fraction < _SHARES["test"] + _SHARES["val"] else "train"
 
 
-def claim(out: Path, settings: dict) -> None:
-    """Prepare the folder for a conversion, new or restarted; refuse to mix data made with other settings.
+def prepare_output(out: str | Path, settings: dict) -> None:
+    """Prepares the folder for a conversion, new or restarted, and refuses to mix data made with other settings.
 
     Raises:
         UserError: `out` is a file, holds something else, or holds data made with other settings.
     """
-    marker = out / _SETTINGS
+    out = Path(out)
+    marker = out / SETTINGS
     if marker.is_file():
         changed = _changed_settings(marker, settings)
         if changed:
@@ -166,24 +163,23 @@ def _changed_settings(marker: Path, settings: dict) -> list[str]:
     except ValueError:
         return [f"{marker.name} cannot be read"]
     return [
-        f"{key} {earlier.get(key)!r} there, {value!r} now"
+        f"{key}: {earlier.get(key)!r} there, {value!r} now"
         for key, value in settings.items()
         if earlier.get(key) != value
     ]
 
 
 def _remove_leftovers(root: Path) -> None:
-    """Half-written shapes of a run that was killed."""
-    for scratch in (root / RENDERS).glob("*/.writing-*"):
-        shutil.rmtree(scratch, ignore_errors=True)
-    for scratch in (root / CLOUDS).glob("*/.*"):
-        scratch.unlink(missing_ok=True)
+    """Deletes the half-written files of a run that was killed."""
+    for pattern in (f"{RENDERS}/*/.*.tmp", f"{CLOUDS}/*/.*"):
+        for leftover in root.glob(pattern):
+            remove(leftover)
 
 
-def discard(root: Path) -> None:
-    """Remove a dataset in which nothing could be made."""
-    for name in (RENDERS, CLOUDS, LISTS):
-        shutil.rmtree(root / name, ignore_errors=True)
-    (root / _SETTINGS).unlink(missing_ok=True)
+def discard(root: str | Path) -> None:
+    """Removes a dataset in which nothing could be made."""
+    root = Path(root)
+    for name in (RENDERS, CLOUDS, LISTS, SETTINGS):
+        remove(root / name)
     if not any(root.iterdir()):
         root.rmdir()

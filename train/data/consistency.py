@@ -1,7 +1,7 @@
-"""Do the cloud, the cameras and the depth maps of one shape speak of the same object?
+"""Are the cloud, the cameras and the depth maps of one shape consistent?
 
-The test of the paper's data: project the cloud into every view; nearly all of it must fall into the silhouette, and
-what of it is visible must lie at the depth that the map says.
+The cloud is projected into every view: nearly all of it must fall into the silhouette, and its visible points must lie
+at the depth of the map.
 """
 
 from __future__ import annotations
@@ -16,56 +16,56 @@ from train.data.shape import Shape
 MIN_INSIDE = 0.98
 MAX_RESIDUAL = 0.015
 MIN_COVERED = 0.9
-"""What a single shape must keep. A tree does better on average, 99 % and 0.01, but thin cords fall between the pixels
-of small maps, and points inside of furniture are seen through its gaps."""
-_LONE_INSIDE, _LONE_RESIDUAL = 0.9, 0.05
-"""What a single view must keep."""
+"""Limits for a single shape. A tree is better on average, 99 % and 0.01, but thin cords fall between the pixels of
+small maps, and points inside of furniture are visible through its gaps."""
+_VIEW_INSIDE, _VIEW_RESIDUAL = 0.9, 0.05
+"""Limits for a single view."""
 _CELLS = 28
 """Cells along a side of the map: about two of 2048 surface points fall into one, so few see through to the back."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Agreement:
-    """How one shape's files fit together.
+class Consistency:
+    """How well one shape's cloud, cameras and depth maps fit together.
 
     Attributes:
         id: "synset/model".
         inside: share of the cloud's points, over all views, that project into the silhouette widened by one pixel.
         residual: median |z - depth map| of the cloud's visible points, world units; NaN without depth maps.
         covered: share of the silhouettes' cells, a 28th of the picture wide, that hold a point of the cloud; a cloud
-            that is too small lies inside and leaves cells empty.
-        lone: number of the first view that is far off by itself, None if there is none; the other figures are over
-            all views and do not show it.
+            that is too small leaves cells empty.
+        bad_view: number of the first view that is far off by itself, None if there is none; the other figures are
+            over all views and do not show it.
     """
 
     id: str
     inside: float
     residual: float
     covered: float = 1.0
-    lone: int | None = None
+    bad_view: int | None = None
 
     @property
     def holds(self) -> bool:
-        """True if the files agree as well as exact ones do."""
-        return self.lone is None and self.within(MIN_INSIDE, MAX_RESIDUAL)
+        """True if the files are within the limits of exact ones."""
+        return self.bad_view is None and self.within(MIN_INSIDE, MAX_RESIDUAL)
 
     def within(self, inside: float, residual: float) -> bool:
-        """True if at least that share is inside, and visible points are nearer than that to the depth map."""
+        """True if at least the share `inside` is inside, and the residual is below `residual`."""
         if self.inside < inside:
             return False
         return self.covered >= MIN_COVERED if np.isnan(self.residual) else self.residual < residual
 
     def __str__(self) -> str:
         found = f"{self.inside:.1%} of the points in the silhouette"
-        if self.lone is not None and self.within(MIN_INSIDE, MAX_RESIDUAL):
-            return f"view {self.lone} is off; over all views {found}"
+        if self.bad_view is not None and self.within(MIN_INSIDE, MAX_RESIDUAL):
+            return f"view {self.bad_view} is off; over all views {found}"
         if np.isnan(self.residual):
             return f"{found}, {self.covered:.1%} of the silhouette covered by them"
         return f"{found}, visible ones {self.residual:.3f} from the depth map"
 
 
-class SeenShape:
-    """The views of a shape, ready for clouds and cameras in several frames to be compared with them."""
+class ShapeViews:
+    """The views of a shape, prepared for comparing clouds and cameras in several frames with them."""
 
     def __init__(self, shape: Shape) -> None:
         self.id = shape.id
@@ -77,8 +77,8 @@ class SeenShape:
         self._cam_from_world = shape.camera.cam_from_world.double().numpy()
         self._points = shape.points.double().numpy()
 
-    def agreement(self, turn: np.ndarray | None = None, flip: np.ndarray | None = None) -> Agreement:
-        """How the views agree with the cloud turned by `turn` (3, 3), seen through camera axes turned by `flip`."""
+    def consistency(self, turn: np.ndarray | None = None, flip: np.ndarray | None = None) -> Consistency:
+        """The consistency with the cloud turned by `turn` (3, 3) and the camera axes turned by `flip` (3, 3)."""
         points = self._points if turn is None else self._points @ turn.T
         height, width = self.depth.shape[1:]
         inside, residuals, covered = [], [], []
@@ -94,8 +94,8 @@ class SeenShape:
             column, row, depth = u[framed].astype(int), v[framed].astype(int), depth[framed]
             inside.append(self._wide[view, row, column].sum() / len(points))
 
-            # Visible points are found from the cloud alone, not from the map they are compared with: of those that
-            # fall into one cell, the nearest.
+            # Visible points are found from the cloud alone, not from the map they are compared with: the nearest of
+            # those that fall into one cell.
             cell = (row * _CELLS // height) * _CELLS + column * _CELLS // width
             by_depth = np.argsort(depth, kind="stable")
             cells, first = np.unique(cell[by_depth], return_index=True)
@@ -107,14 +107,14 @@ class SeenShape:
         errors = np.concatenate(residuals)
         medians = [np.median(each) if each.size else 0.0 for each in residuals]
         off = [
-            share < _LONE_INSIDE or median > _LONE_RESIDUAL
+            share < _VIEW_INSIDE or median > _VIEW_RESIDUAL
             for share, median in zip(inside, medians, strict=True)
         ]
         if np.isnan(self.depth).any():
             residual = float("nan")
         else:
             residual = float(np.median(errors)) if errors.size else float("inf")
-        return Agreement(
+        return Consistency(
             self.id,
             float(np.mean(inside)),
             residual,
@@ -123,9 +123,9 @@ class SeenShape:
         )
 
 
-def agreement(shape: Shape) -> Agreement:
-    """Project the cloud into every view and compare it with mask and depth."""
-    return SeenShape(shape).agreement()
+def measure_consistency(shape: Shape) -> Consistency:
+    """Projects the cloud into every view and compares it with mask and depth."""
+    return ShapeViews(shape).consistency()
 
 
 def _cell_share(silhouette: np.ndarray) -> np.ndarray:

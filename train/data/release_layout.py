@@ -1,4 +1,4 @@
-"""The tree of the paper's release, which is also the one that this program writes; see `train.data.store`.
+"""Reading the tree of the paper's release, which is also the one that this program writes (`train.data.tree_files`).
 
 The release differs in details: cameras are MATLAB files (K, extrinsic), renders have an alpha channel, there is no list
 for validation, and clouds may keep the folder name under which they are distributed.
@@ -13,29 +13,27 @@ from pathlib import Path
 
 import numpy as np
 import scipy.io
-import torch
 from torch import Tensor
 
-from diffpoint.camera import PinholeCamera
 from diffpoint.io import read_depth
-from train.data import store
-from train.data.images import on_white
-from train.data.shape import ShapeError, ViewsRead, make_camera, read_file, read_pixels
+from train.data import tree_files
+from train.data.images import decode, on_white
+from train.data.shape import Shape, ShapeError, assembled, make_camera, read_file
 from train.errors import UserError
 
-CLOUD_FOLDERS = (store.CLOUDS, "shape_net_core_uniform_samples_2048")
+CLOUD_FOLDERS = (tree_files.CLOUDS, "shape_net_core_uniform_samples_2048")
 """Names of the folder with the clouds; the second is that of the archive in which ShapeNet's are distributed."""
 _VALIDATION_SHARE = 0.1
 _NUMBERED = re.compile(r"(?:render|depth|camera)_(\d+)\.(?:png|json|mat)")
 
 
-def listed(root: Path, split: str) -> dict[str, list[str]]:
-    """Synset -> "synset/model" of every line of the split's lists.
+def listed(root: str | Path, split: str) -> dict[str, list[str]]:
+    """Synset -> "synset/model" of every line of the split's lists, not checked; see `is_shape_id`.
 
     A tree with lists for training and testing only keeps a tenth of the training shapes for validation, chosen by
     their names.
     """
-    lists = root / store.LISTS
+    lists = Path(root) / tree_files.LISTS
     if (lists / split).is_dir() or (split == "train" and not (lists / "test").is_dir()):
         shapes = _read_lists(lists / split)
         lacks_validation = split == "train" and not (lists / "val").is_dir()
@@ -62,37 +60,39 @@ def _fraction(shape: str) -> float:
     return int.from_bytes(hashlib.sha256(f"validation {shape}".encode()).digest()[:8], "big") / 2**64
 
 
-class Release:
+class ReleaseLayout:
     """A tree with `rendered-shapenet`, clouds and lists."""
 
     has_depth = True
 
     def __init__(self, root: Path) -> None:
-        if not (root / store.LISTS).is_dir():
-            raise UserError(f"the data at {root} are not finished; run the command that makes them again")
+        if not (root / tree_files.LISTS).is_dir():
+            raise UserError(
+                f"the data at {root} are incomplete: no {tree_files.LISTS}; run the command that makes them again"
+            )
         self.root = root
         clouds = [root / name for name in CLOUD_FOLDERS if (root / name).is_dir()]
-        self._clouds = clouds[0] if clouds else root / store.CLOUDS
+        self._clouds = clouds[0] if clouds else root / tree_files.CLOUDS
 
     def listed(self, split: str) -> dict[str, list[str]]:
         """Synset -> the shapes that the split's lists name."""
         return listed(self.root, split)
 
     def folder(self, shape: str) -> Path:
-        """Where the views are."""
-        return store.render_folder(self.root, shape)
+        """The folder with the views of a shape."""
+        return tree_files.render_folder(self.root, shape)
 
     def cloud_file(self, shape: str) -> Path:
-        """Where the ground truth is."""
+        """The file with the ground-truth cloud of a shape."""
         return self._clouds / f"{shape}.ply"
 
     def on_disk(self) -> list[str]:
-        """Every shape that has a folder, in a list or not."""
-        folders = sorted((self.root / store.RENDERS).glob("*/[!.]*"))
+        """Every shape that has a folder, listed or not."""
+        folders = sorted((self.root / tree_files.RENDERS).glob("*/[!.]*"))
         return [f"{folder.parent.name}/{folder.name}" for folder in folders]
 
-    def read_views(self, shape: str) -> ViewsRead:
-        """All views of a shape.
+    def read(self, shape: str) -> Shape:
+        """Reads a shape, as its files have it.
 
         Raises:
             ShapeError: a file is missing or broken, or the pictures have different sizes.
@@ -104,23 +104,13 @@ class Release:
         count = max(numbers) + 1
         images = [read_file(shape, folder / f"render_{i}.png", _read_image) for i in range(count)]
         depth = [read_file(shape, folder / f"depth_{i}.png", read_depth) for i in range(count)]
-        size = images[0].shape[1:]
-        for i in range(count):
-            if images[i].shape[1:] != size or depth[i].shape != size:
-                raise ShapeError(
-                    f"{shape}: {folder}: the pictures of view {i} are {tuple(images[i].shape[1:])} and "
-                    f"{tuple(depth[i].shape)} pixels, view 0 is {tuple(size)}"
-                )
         cameras = [read_file(shape, _camera_file(folder, i), _read_camera) for i in range(count)]
-        K, cam_from_world = (torch.stack(matrices) for matrices in zip(*cameras, strict=True))
-        return ViewsRead(
-            torch.stack(images), torch.stack(depth), PinholeCamera(K, cam_from_world, size[0], size[1])
-        )
+        return assembled(shape, folder, images, depth, cameras, self.cloud_file(shape))
 
 
 def _read_image(path: Path) -> Tensor:
     """(3, H, W) in [0, 1]; transparency shows white."""
-    return on_white(read_pixels(path))
+    return on_white(decode(path))
 
 
 def _camera_file(folder: Path, view: int) -> Path:

@@ -1,8 +1,8 @@
-"""In which frame are a tree's clouds, in which its cameras? Found by trying, undone when shapes are read.
+"""The axis conventions of a tree's clouds and cameras: found by trying all of them, converted when shapes are read.
 
 Trees from elsewhere mix conventions: ShapeNet's OBJ files and the clouds sampled from them have y up, Blender's world
-has z up, Blender's and OpenGL's cameras look along -z. Depth maps decide: of all ways to name and turn the axes, the
-right one puts the cloud into the silhouettes and its visible points at the depth that was recorded.
+has z up, Blender's and OpenGL's cameras look along -z. Of all ways to name and turn the axes, the right one puts the
+cloud into the silhouettes and its visible points at the depth of the maps.
 """
 
 from __future__ import annotations
@@ -10,21 +10,18 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from train.data.agreement import SeenShape
+from train.data.consistency import ShapeViews
 from train.data.shape import Shape
 
 SAMPLE = 6
-"""Shapes that vote; one chair may look the same when turned, six shapes seldom do."""
-RECORD = "made_with.json"
-"""The mark of trees that this program made: there is nothing to find out about them."""
+"""Number of shapes that are tried; one chair may look the same when turned, six shapes seldom do."""
 
 _INSIDE, _RESIDUAL = 0.96, 0.03
-"""What a vote asks for, less than of a whole tree: a right frame with inexact cameras comes nearer than a wrong one."""
+"""Limits by which a shape fits a convention; lower than those of `data check`, for trees with inexact cameras."""
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _AXES = "xyz"
 
@@ -50,13 +47,13 @@ TURNS = _turns()
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frame:
-    """What is done to a tree's shapes when they are read, so that all speak of one world with y up.
+    """How a tree's shapes are converted when they are read: to one world with y up and OpenCV's camera axes.
 
     Attributes:
         turn_cloud: (3, 3), world from the files of clouds.
         turn_world: (3, 3), world from the world in which the cameras were written down.
         turn_camera: (3, 3), OpenCV's camera axes from those of the files.
-        verdict: one line for people.
+        verdict: what was found, in one line.
         settled: False if no convention makes clouds and views agree; nothing is turned then.
     """
 
@@ -74,7 +71,7 @@ class Frame:
         )
 
     def applied(self, shape: Shape) -> Shape:
-        """The shape in the world with y up and OpenCV's cameras."""
+        """The shape, converted."""
         if not self.changes:
             return shape
         camera_turn, world_turn = np.eye(4), np.eye(4)
@@ -95,17 +92,19 @@ def find_frame(shapes: Sequence[Shape]) -> Frame:
         shapes: a few, as their files have them; the more they differ the better.
     """
     if not shapes:
-        return dataclasses.replace(AS_IT_IS, verdict="nothing to tell frames by", settled=False)
-    seen = [SeenShape(shape) for shape in shapes]
+        return dataclasses.replace(
+            AS_IT_IS, verdict="no readable shape to find the frames from", settled=False
+        )
+    seen = [ShapeViews(shape) for shape in shapes]
     best: tuple[int, np.ndarray, np.ndarray] = (0, np.eye(3), np.eye(3))
     for turns in (TURNS[:1], TURNS[:24], TURNS[24:]):
         for flip, turn in itertools.product((np.eye(3), _OPENGL), turns):
-            votes = sum(each.agreement(turn, flip).within(_INSIDE, _RESIDUAL) for each in seen)
+            votes = sum(each.consistency(turn, flip).within(_INSIDE, _RESIDUAL) for each in seen)
             if votes > best[0]:
                 best = (votes, turn, flip)
         if 2 * best[0] > len(shapes):
             return _frame(best[1], best[2], shapes)
-    mean = np.mean([each.agreement().inside for each in seen])
+    mean = np.mean([each.consistency().inside for each in seen])
     verdict = (
         f"no axis convention makes clouds and views agree ({mean:.0%} of the points in the silhouettes as the files "
         "are); clouds of other models, another scale, or wrong cameras"
@@ -114,12 +113,12 @@ def find_frame(shapes: Sequence[Shape]) -> Frame:
 
 
 def _frame(turn: np.ndarray, flip: np.ndarray, shapes: Sequence[Shape]) -> Frame:
-    """`turn` takes clouds to the cameras' world; now both go to a world with y up, and the fewer are turned."""
+    """`turn` takes clouds to the cameras' world. Both go to a world with y up; what has y up already is not turned."""
     camera_up = _camera_up(shapes, flip)
     cloud_up = np.round(turn.T @ camera_up)
     y_up, proper = np.array([0.0, 1.0, 0.0]), np.linalg.det(turn) > 0
     if proper and np.array_equal(cloud_up, y_up):
-        to_world = turn.T  # the clouds are right already
+        to_world = turn.T  # the clouds have y up already
     elif np.array_equal(camera_up, y_up):
         to_world = np.eye(3)
     else:
@@ -144,30 +143,30 @@ def _verdict(
     cloud_up: np.ndarray,
     camera_up: np.ndarray,
 ) -> str:
-    said = []
+    found = []
     if np.linalg.det(turn) < 0:
-        said.append("clouds are mirrored")
+        found.append("clouds are mirrored")
     if np.array_equal(turn, np.eye(3)):
-        said.append(f"clouds and cameras are in one frame, {_name(cloud_up)} up")
+        found.append(f"clouds and cameras are in one frame, {_name(cloud_up)} up")
     else:
-        said.append(f"clouds are {_name(cloud_up)}-up, cameras expect {_name(camera_up)}-up")
+        found.append(f"clouds are {_name(cloud_up)}-up, cameras expect {_name(camera_up)}-up")
         if np.array_equal(cloud_up, camera_up):
-            said[-1] += f", turned to each other: cloud {describe(turn)}"
+            found[-1] += f", turned to each other: cloud {describe(turn)}"
     if not np.array_equal(flip, np.eye(3)):
-        said.append("cameras look along -z (OpenGL, Blender)")
-    mended = []
+        found.append("cameras look along -z (OpenGL, Blender)")
+    changes = []
     if not np.array_equal(turn_cloud, np.eye(3)):
-        mended.append(f"clouds are turned, (x, y, z) -> {describe(turn_cloud)}")
+        changes.append(f"clouds are turned, (x, y, z) -> {describe(turn_cloud)}")
     if not np.array_equal(to_world, np.eye(3)):
-        mended.append(f"cameras are turned, their world (x, y, z) -> {describe(to_world)}")
+        changes.append(f"cameras are turned, their world (x, y, z) -> {describe(to_world)}")
     if not np.array_equal(flip, np.eye(3)):
-        mended.append("cameras get OpenCV's axes")
-    line = "; ".join(said)
-    return f"{line}: {' and '.join(mended)} when they are read" if mended else line
+        changes.append("cameras get OpenCV's axes")
+    line = "; ".join(found)
+    return f"{line}: {' and '.join(changes)} when they are read" if changes else line
 
 
 def describe(turn: np.ndarray) -> str:
-    """A renaming of axes in words.
+    """A turn (3, 3) by the axes that it puts in place of x, y and z.
 
     Example:
         >>> describe(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
@@ -179,8 +178,3 @@ def describe(turn: np.ndarray) -> str:
 
 def _name(axis: np.ndarray) -> str:
     return ("-" if axis.min() < 0 else "") + _AXES[int(np.argmax(np.abs(axis)))]
-
-
-def is_own(root: Path) -> bool:
-    """True for a tree that this program made."""
-    return (root / RECORD).is_file()

@@ -1,31 +1,30 @@
-"""The renderings of Choy et al. (3D-R2N2, 2016), read as they are: 24 views of 137 x 137 pixels for each model.
+"""Reading the renderings of Choy et al. (3D-R2N2, 2016): 24 views of 137 x 137 pixels for each model.
 
     ShapeNetRendering/<synset>/<model>/rendering/{00.png ... 23.png, renderings.txt, rendering_metadata.txt}
     pcdata_2048/<synset>/<model>.ply            inside or beside it: the ground truth, not part of their archive
     data_list/{train,val,test}/<synset>.list    inside or beside it, if you have lists
 
-There are no depth maps: such a tree serves reconstruction and evaluation, not training.
+There are no depth maps: such a tree can be reconstructed from and evaluated on, not trained on.
 
 A line of the metadata is azimuth, elevation and in-plane angle in degrees, a distance ratio and a field of view. Their
 renderer (lib/blender_renderer.py of the 3D-R2N2 repository) puts the camera at 1.75 times the ratio from the origin and
 never applies the field of view: the lens is Blender's own, 35 mm before a sensor of 32 mm. Models are ShapeNet v1's OBJ
-files, which Blender turns from y up to z up when it loads them. In the frame of the OBJ files, y up, azimuth 0 stands
-on +x and azimuth 90 on +z.
+files, which Blender turns from y up to z up when it loads them. In the frame of the OBJ files, y up, azimuth 0 is on
++x and azimuth 90 on +z.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from diffpoint.camera import PinholeCamera
-from train.data import store
-from train.data.images import on_white
-from train.data.release import CLOUD_FOLDERS, listed
-from train.data.shape import ShapeError, ViewsRead, make_camera, read_file, read_pixels
+from train.data import tree_files
+from train.data.images import decode, on_white
+from train.data.release_layout import CLOUD_FOLDERS, listed
+from train.data.shape import Shape, ShapeError, assembled, make_camera, read_file
 from train.errors import UserError
 
 NAME = "ShapeNetRendering"
@@ -65,8 +64,8 @@ def cam_from_world(
     return pose
 
 
-class Choy:
-    """A tree of their renderings, with clouds that the user has put inside or beside it."""
+class ChoyLayout:
+    """A tree of these renderings, with clouds that the user has put inside or beside it."""
 
     has_depth = False
 
@@ -77,33 +76,33 @@ class Choy:
         clouds = [base / name for base in beside for name in CLOUD_FOLDERS if (base / name).is_dir()]
         if not clouds:
             raise UserError(
-                f"{root} holds pictures and no ground truth: put or link the clouds, <synset>/<model>.ply, at "
-                f"{root / store.CLOUDS}; pictures alone can be reconstructed from: "
+                f"{root} holds pictures but no ground truth: put or link the clouds, <synset>/<model>.ply, at "
+                f"{root / tree_files.CLOUDS}; pictures alone can be reconstructed from: "
                 f"python -m train reconstruct pretrained {renderings}/SYNSET/MODEL --out DIR"
             )
         self._clouds = clouds[0]
-        lists = [base for base in beside if (base / store.LISTS).is_dir()]
+        lists = [base for base in beside if (base / tree_files.LISTS).is_dir()]
         self._lists = lists[0] if lists else None
 
     def listed(self, split: str) -> dict[str, list[str]]:
-        """Synset -> the shapes of the split: the lists', or without lists a split by the shapes' names."""
+        """Synset -> the shapes of the split: from the lists, or without lists by the shapes' names."""
         if self._lists is not None:
             return listed(self._lists, split)
         members: dict[str, list[str]] = {}
         for shape in self.on_disk():
             members.setdefault(shape.split("/")[0], []).append(shape)
-        split_of = {synset: store.split_shapes(shapes, seed=0) for synset, shapes in members.items()}
+        split_of = {synset: tree_files.split_shapes(shapes, seed=0) for synset, shapes in members.items()}
         return {
             synset: [shape for shape in shapes if split_of[synset][shape] == split]
             for synset, shapes in members.items()
         }
 
     def folder(self, shape: str) -> Path:
-        """Where the views are."""
+        """The folder with the views of a shape."""
         return self._renderings / shape / "rendering"
 
     def cloud_file(self, shape: str) -> Path:
-        """Where the ground truth is."""
+        """The file with the ground-truth cloud of a shape."""
         return self._clouds / f"{shape}.ply"
 
     def on_disk(self) -> list[str]:
@@ -111,8 +110,8 @@ class Choy:
         folders = sorted(self._renderings.glob(f"{_SYNSET}/*/rendering"))
         return [f"{folder.parent.parent.name}/{folder.parent.name}" for folder in folders]
 
-    def read_views(self, shape: str) -> ViewsRead:
-        """All views of a shape; depth is NaN inside the silhouettes.
+    def read(self, shape: str) -> Shape:
+        """Reads a shape, in the frame of the OBJ files; depth is NaN inside the silhouettes.
 
         Raises:
             ShapeError: a file is missing or broken, or the files do not fit together.
@@ -126,33 +125,27 @@ class Choy:
             raise ShapeError(f"{shape}: {folder}: {len(names)} pictures and {len(rows)} lines of {_METADATA}")
         pictures = [read_file(shape, folder / name, _read_picture) for name in names]
         images, depth = [image for image, _ in pictures], [depth for _, depth in pictures]
-        size = depth[0].shape
-        for name, each in zip(names, depth, strict=True):
-            if each.shape != size:
-                raise ShapeError(
-                    f"{shape}: {folder / name} is {tuple(each.shape)} pixels, {names[0]} is {tuple(size)}"
-                )
-        focal = FOCAL_PER_PIXEL * size[1]
-        K = np.array([[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1]])
+        height, width = depth[0].shape
+        focal = FOCAL_PER_PIXEL * width
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         cameras = [
             make_camera(K, cam_from_world(azimuth, elevation, in_plane, MAX_DISTANCE * ratio))
             for azimuth, elevation, in_plane, ratio, *_ in rows
         ]
-        Ks, poses = (torch.stack(matrices) for matrices in zip(*cameras, strict=True))
-        return ViewsRead(torch.stack(images), torch.stack(depth), PinholeCamera(Ks, poses, size[0], size[1]))
+        return assembled(shape, folder, images, depth, cameras, self.cloud_file(shape))
 
 
-def find_renderings(root: Path) -> Path | None:
+def find_renderings(root: str | Path) -> Path | None:
     """The folder of synsets below `root`, if this is a tree of Choy's renderings."""
-    for base in (root, root / NAME):
+    for base in (Path(root), Path(root) / NAME):
         if next(base.glob(f"{_SYNSET}/*/rendering"), None) is not None:
             return base
     return None
 
 
-def pictures_of(folder: Path) -> list[Path]:
+def pictures_of(folder: str | Path) -> list[Path]:
     """The pictures of one model, given its folder or the `rendering` in it; empty if it is neither."""
-    for base in (folder, folder / "rendering"):
+    for base in (Path(folder), Path(folder) / "rendering"):
         if (base / _METADATA).is_file():
             return sorted(base.glob("[0-9]*.png"))
     return []
@@ -171,12 +164,16 @@ def _read_metadata(path: Path) -> list[list[float]]:
 
 
 def _read_names(path: Path) -> list[str]:
-    return [line.strip() for line in path.read_text().splitlines() if line.strip()]
+    names = [line.strip() for line in path.read_text().splitlines() if line.strip()]
+    for number, name in enumerate(names, start=1):
+        if PurePath(name).name != name:
+            raise ValueError(f"line {number} is no file name: {name!r}")
+    return names
 
 
 def _read_picture(path: Path) -> tuple[Tensor, Tensor]:
     """(3, H, W) on white, and (H, W): NaN where the alpha channel says that something is seen, +inf elsewhere."""
-    pixels = read_pixels(path)
+    pixels = decode(path)
     if pixels.shape[2] not in (2, 4):
         raise ValueError("has no alpha channel to say where the object is")
     top = np.iinfo(pixels.dtype).max

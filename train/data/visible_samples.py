@@ -1,4 +1,4 @@
-"""Ground truth without what is inside: samples of the surface that a view, or anybody outside, can see."""
+"""Ground truth without the inside: samples of the surface that are visible in a view, or from outside."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from train.data.render import Orbit, Renderer, orbit_camera
 from train.data.surface import sample_triangles
 
 _CAMERAS, _SIZE = 64, 320
-_DRAWN_AT_ONCE = 4  # for each point that is wanted
+_DRAWN_AT_ONCE = 4  # candidates for each requested point
 _ROUNDS = 8
 _SAME, _NEAR = 1e-4, 0.02
 """Shares of the depth. A face hides a point if its plane is nearer by more than the first on the ray to the point; the
-plane is trusted only near the centre of the point's pixel, where the face was met."""
+plane counts only if the depth at the pixel's centre differs from the point's by less than the second."""
 
 
-def sample_seen(
+def sample_visible(
     renderer: Renderer, camera: PinholeCamera, count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Points (count, 3), uniform by area on what can be seen of the surface.
+    """Points (count, 3), uniform by area on the visible part of the surface.
 
-    The bottoms of drawers, and what of a part is inside another, are left out: no picture shows them. A point is seen
-    if one of the views' cameras (V,) sees it, or one of 64 cameras all around.
+    The bottoms of drawers, and parts inside of others, are left out: no picture shows them. A point is visible if one
+    of the views' cameras (V,) sees it, or one of 64 cameras all around.
 
     Raises:
-        MeshError: nearly nothing of the surface can be seen.
+        MeshError: nearly nothing of the surface is visible.
 
     Example:
         >>> from train.data.solids import box, surface_of
         >>> outer, inner = (box((size,) * 3, (0, 0, 0), np.ones(3)) for size in (0.5, 0.4))
         >>> renderer, rng = Renderer(surface_of([outer, inner])), np.random.default_rng(0)
-        >>> points = sample_seen(renderer, orbit_camera(np.zeros(1), np.zeros(1), 64), 500, rng)
+        >>> points = sample_visible(renderer, orbit_camera(np.zeros(1), np.zeros(1), 64), 500, rng)
         >>> bool(np.isclose(np.abs(points).max(1), 0.25).all())
         True
     """
@@ -50,7 +50,7 @@ def sample_seen(
         kept.append(points[seen])
         if sum(map(len, kept)) >= count:
             return np.concatenate(kept)[:count]
-    raise MeshError("nearly nothing of its surface can be seen from outside")
+    raise MeshError("nearly nothing of its surface is visible from outside")
 
 
 def _sees(
