@@ -23,6 +23,7 @@ from train.evaluation.runs import load_autoencoder
 from train.experiments.store import Metrics
 from train.experiments.study import Study
 from train.experiments.table import Row
+from train.methods import get_method
 
 _PREDICTIONS = 10
 _NEAREST_AMONG = 300
