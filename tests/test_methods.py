@@ -32,7 +32,7 @@ from train.data.batches import Batch, LoadedSplit, Targets, load_split
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate
 from train.evaluation.inference import reconstruct
-from train.evaluation.per_shape import compare, score
+from train.evaluation.per_shape import compare_clouds, evaluate_split
 from train.evaluation.runs import config_of, load_generator, load_predictor, read_metrics
 from train.methods import METHODS, Entry, get_method, recipe
 from train.methods.base import Step
@@ -317,8 +317,8 @@ def test_an_oracle_is_far_better_than_a_fresh_network(system: str, tiny_data: Pa
     network = method.build(config)
     oracle = method.oracle(network, split.targets(torch.arange(len(split))))
     assert oracle is not None
-    best = compare(oracle, split.points, points=network.points)
-    fresh = score(network, split, config.inference, views=2, seed=0)
+    best = compare_clouds(oracle, split.points, points=network.points)
+    fresh = evaluate_split(network, split, config.inference, views=2, seed=0)
     assert (best["cd"] < 0.6 * fresh["cd"]).all()
     if system != "ptn":  # the visual hull of these data's few views is far larger than the shape
         cell = 100 / 16  # the smallest grids and maps have 16 cells to the unit
@@ -427,22 +427,22 @@ def test_a_run_of_each_method_is_trained_evaluated_and_used(
 def test_predictions_of_several_views_are_scored_one_by_one(tiny_data: Path) -> None:
     split, config = _split(tiny_data, "ptn", limit=3), recipe("ptn", "smoke")
     network = get_method("ptn").build(config)
-    each = score(network, split, config.inference, views=3, seed=0)
+    each = evaluate_split(network, split, config.inference, views=3, seed=0)
     joined_settings = dataclasses.replace(config.inference, scored="joined")
-    joined = score(network, split, joined_settings, views=3, seed=0)
+    joined = evaluate_split(network, split, joined_settings, views=3, seed=0)
     found = reconstruct(network, split.float_images(torch.arange(3), torch.arange(3).expand(3, -1)))
     assert found.points.shape == (3, 3 * network.points, 3)
     assert found.codes.shape == (3, 3, 0)
     assert (each["best_cd"] <= each["cd"]).all()
     assert "best_cd" not in joined
     assert (joined["gt_to_pred"] < each["gt_to_pred"]).all()  # three times the points
-    one = score(network, split, config.inference, views=1, seed=0)
+    one = evaluate_split(network, split, config.inference, views=1, seed=0)
     torch.testing.assert_close(one["best_cd"], one["cd"])
 
 
 def test_a_network_that_reads_views_together_has_no_consistency(tiny_data: Path) -> None:
     split, config = _split(tiny_data, "r2n2", limit=2), recipe("r2n2", "smoke")
-    scores = score(get_method("r2n2").build(config), split, config.inference, views=3, seed=0)
+    scores = evaluate_split(get_method("r2n2").build(config), split, config.inference, views=3, seed=0)
     assert "consistency" not in scores
     assert scores["cd"].shape == (2,)
 
@@ -453,7 +453,7 @@ def test_dense_predictions_are_thinned_to_the_size_of_the_others(tiny_data: Path
     network = get_method("lin").build(config)
     found = reconstruct(network, split.float_images(torch.arange(1), torch.zeros(1, 1, dtype=torch.int64)))
     assert found.points.shape[1] == 4 * network.points
-    scores = score(network, split, config.inference, views=1, seed=0)
+    scores = evaluate_split(network, split, config.inference, views=1, seed=0)
     assert (scores["fps_gt_to_pred"] > scores["gt_to_pred"]).all()
 
 
@@ -480,7 +480,7 @@ def test_a_new_method_is_one_file_and_one_line(
     assert type(network).__name__ == "BoxNetwork"
     assert method_of(network).name == "boxes"
     result = evaluate(run, tiny_data, seeds=(0,), views=(1, 3), progress=False)
-    fresh = score(
+    fresh = evaluate_split(
         get_method("boxes").build(config), _split(tiny_data, "boxes"), config.inference, views=1, seed=0
     )
     assert result["views"]["1"]["cd"] < fresh["cd"].mean()

@@ -10,7 +10,7 @@ import torch
 from models import Predictor
 from train.config import FitConfig
 from train.data.batches import LoadedSplit
-from train.evaluation.per_shape import SHAPES_AT_ONCE, compare, joined
+from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, of_method, unchanged
 from train.experiments.table import Claim, Row, Table, below
@@ -117,8 +117,8 @@ def _oracle(row: Row, study: Study, config: FitConfig) -> Metrics:
         for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
             clouds = method.oracle(network, test.targets(shapes))
             assert clouds is not None
-            parts.append(compare(clouds, test.points[shapes], points=network.points))
-        return joined(parts)
+            parts.append(compare_clouds(clouds, test.points[shapes], points=network.points))
+        return concatenate(parts)
 
     return study.measure(config, ["oracle"], measure, stage=0)
 

@@ -24,7 +24,7 @@ from models import Predictor
 from train.config import FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
 from train.data.batches import LoadedSplit
 from train.errors import UserError
-from train.evaluation.per_shape import SHAPES_AT_ONCE, compare, joined, score
+from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate, evaluate_split
 from train.evaluation.retrieval import medoid, nearest_by_image
 from train.evaluation.runs import best_weights, load_predictor, read_split
 from train.experiments import store
@@ -286,7 +286,7 @@ class Study:
         return self.measure(
             config,
             what,
-            lambda model, data: score(
+            lambda model, data: evaluate_split(
                 model, data, settings, views=views, seed=config.seed, code_seed=code_seed
             ),
             stage=stage,
@@ -313,7 +313,9 @@ class Study:
             else:
                 clouds = train.points[nearest_by_image(test, train, views=(views,))[views]]
             parts = zip(clouds.split(SHAPES_AT_ONCE), test.points.split(SHAPES_AT_ONCE), strict=True)
-            return joined([compare(cloud.contiguous(), true, points=points) for cloud, true in parts])
+            return concatenate(
+                [compare_clouds(cloud.contiguous(), true, points=points) for cloud, true in parts]
+            )
 
         size = get_method(config.system).image_size(config)
         key = [baseline, points, size, views, train.fingerprint, test.fingerprint]

@@ -12,7 +12,13 @@ from models import Critic, Predictor, critic_loss, gradient_penalty
 from train.config import FitConfig, StageConfig
 from train.data.batches import Batch, LoadedSplit
 from train.evaluation.metrics import visible_error
-from train.evaluation.per_shape import answers, distance_between, distance_to_nearest, joined, one_view_each
+from train.evaluation.per_shape import (
+    concatenate,
+    distance_to_nearest,
+    one_view_each,
+    pairwise_distance,
+    sample_predictions,
+)
 from train.evaluation.runs import load_autoencoder
 from train.experiments.store import Metrics
 from train.experiments.study import Study
@@ -44,7 +50,7 @@ def ten_predictions(row: Row, study: Study, config: FitConfig) -> Metrics:
 
     def distances(source: Source, test: LoadedSplit) -> Metrics:
         real = train.points[some, :points]
-        return joined(
+        return concatenate(
             [_distances(shown, clouds, real=real) for _, shown, clouds in source(test, _PREDICTIONS)]
         )
 
@@ -82,7 +88,9 @@ def _measure(
         return study.kept(key, lambda: function(source, test))
 
     def of_network(model: Predictor, test: LoadedSplit) -> Metrics:
-        return function(lambda split, count: answers(model, split, codes=count, seed=config.seed), test)
+        return function(
+            lambda split, count: sample_predictions(model, split, codes=count, seed=config.seed), test
+        )
 
     return study.measure(
         config, [f"{name} of predictions", _PREDICTIONS, *inputs], of_network, stage=row.stage
@@ -104,7 +112,7 @@ def _samples(
 def _distances(shown: Batch, clouds: Tensor, *, real: Tensor) -> Metrics:
     visible = [visible_error(cloud, shown.camera, shown.depth)[:, 0] for cloud in clouds]
     return {
-        "diversity": distance_between(clouds),
+        "diversity": pairwise_distance(clouds),
         "visible": torch.stack(visible).mean(0),
         "novelty": distance_to_nearest(clouds[0], real),
     }

@@ -1,4 +1,4 @@
-"""Model selection: the validation split's errors with fixed random codes, without search or descent."""
+"""Model selection: errors on the validation split with fixed random codes, without search or descent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from train.data.batches import LoadedSplit
 from train.distributed import SINGLE, World
 from train.evaluation.metrics import cloud_errors, in_silhouette, thin_out, visible_error
 
-FIGURES = ("val_cd_1", "val_cd", "val_fps_cd", "val_visible", "val_inside")
+METRICS = ("val_cd_1", "val_cd", "val_fps_cd", "val_visible", "val_inside")
 _SHAPES_AT_ONCE = 8
 
 
@@ -26,7 +26,7 @@ def validate(model: Predictor, split: LoadedSplit, *, seed: int, world: World = 
     """
     generator = torch.Generator().manual_seed(seed)
     codes = torch.randn(len(split), split.views, model.code_dim, generator=generator)
-    sums = torch.zeros(len(FIGURES))
+    sums = torch.zeros(len(METRICS))
     for shapes in torch.arange(world.rank, len(split), world.size).split(_SHAPES_AT_ONCE):
         views = torch.arange(split.views).expand(len(shapes), -1)
         images = split.float_images(shapes, views)
@@ -49,14 +49,15 @@ def validate(model: Predictor, split: LoadedSplit, *, seed: int, world: World = 
             ]
         )
     means = (world.sum(sums) / len(split)).tolist()
-    return dict(zip(FIGURES, means, strict=True))
+    return dict(zip(METRICS, means, strict=True))
 
 
 @torch.no_grad()
 def validate_autoencoder(model: Autoencoder, split: LoadedSplit, *, seed: int) -> dict[str, float]:
-    """Mean chamfer distance x100 between clouds of the split and what the auto-encoder makes of them.
+    """Mean chamfer distance x100 between the split's clouds and their reconstructions by the auto-encoder.
 
-    It reads as many points as it writes, the same at every call, and is measured against all.
+    Its input is a random subset of the points, the same at every call and as large as its output; the reconstruction
+    is compared with all points.
     """
     generator = torch.Generator().manual_seed(seed)
     some = torch.randperm(split.points.shape[1], generator=generator)[: model.config.points]

@@ -14,7 +14,7 @@ from models import Predictor
 from train.config import FitConfig, InferenceConfig, StageConfig, Supervision, fit_config_from_json
 from train.data.batches import Batch, LoadedSplit
 from train.evaluation.metrics import cloud_errors, in_silhouette, visible_error
-from train.evaluation.per_shape import answers, joined, one_view_each
+from train.evaluation.per_shape import concatenate, one_view_each, sample_predictions
 from train.evaluation.runs import read_metrics
 from train.experiments.statistics import spread
 from train.experiments.store import Metrics
@@ -114,8 +114,8 @@ def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> Metrics:
     that it sees (1: as dense as behind); "imbalance": which share of the points would have to move to another of 32
     parts of the surface for all parts to be as dense (0 to 1).
     """
-    answered = answers(model, test, codes=1, seed=seed)
-    return joined(
+    answered = sample_predictions(model, test, codes=1, seed=seed)
+    return concatenate(
         [single_view_metrics(made[0], test.points[shapes], shown) for shapes, shown, made in answered]
     )
 
@@ -234,7 +234,7 @@ def _floor(study: Study) -> dict[str, float]:
         single_view_metrics(test.clouds(shapes, some[shapes]), test.points[shapes], shown)
         for shapes, shown in one_view_each(test, 0)
     ]
-    return {name: values.mean().item() for name, values in joined(found).items()}
+    return {name: values.mean().item() for name, values in concatenate(found).items()}
 
 
 def _single(study: Study, training: Training) -> dict[str, Any]:
@@ -265,8 +265,8 @@ def _measured(study: Study, config: FitConfig, stage: Literal[1, 2]) -> dict[str
     alone = study.measure(
         config, "single views", lambda m, d: single_views(m, d, seed=config.seed), stage=stage
     )
-    joined = study.reconstruction_metrics(config, _RANDOM, stage=stage, views=_VIEWS)
-    both = {**alone, "cd": joined["cd"], "fps_cd": joined["fps_cd"]}
+    concatenate = study.reconstruction_metrics(config, _RANDOM, stage=stage, views=_VIEWS)
+    both = {**alone, "cd": concatenate["cd"], "fps_cd": concatenate["fps_cd"]}
     return {name: values.mean().item() for name, values in both.items()}
 
 
