@@ -12,14 +12,12 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
-from train.methods.systems import build_network
 
 from diffpoint import PinholeCamera, chamfer_distance, unproject
 from models import Generator, build_generator
 from models.parts import PointDecoder
 from models.sizes import PROFILES as SIZES
 from train.__main__ import main
-from train.config import PROFILES
 from train.errors import UserError
 from train.evaluation.metrics import in_silhouette, visible_error
 from train.experiments.front_vs_projection import experiment, networks_page, page
@@ -28,6 +26,7 @@ from train.experiments.front_vs_projection.networks import TRAININGS, configs, d
 from train.experiments.front_vs_projection.shapes import Cameras, embedded_shape, shapes_of
 from train.experiments.run import run_experiment
 from train.experiments.study import Study
+from train.methods import get_method, recipe
 from train.methods.losses import Scene, supervise
 
 INFINITY = float("inf")
@@ -198,7 +197,7 @@ def test_networks_are_trained_measured_and_resumed(
 
 
 def test_trainings_differ_in_their_loss_alone() -> None:
-    made = [training.config(PROFILES["cpu"], single=True) for training in TRAININGS.values()]
+    made = [training.config(recipe("ours", "cpu"), single=True) for training in TRAININGS.values()]
     plain = {
         dataclasses.replace(
             config,
@@ -253,7 +252,7 @@ def plate() -> Scene:
 
 @pytest.mark.parametrize("front", ["emd", "chamfer"])
 def test_projection_losses_take_the_unit_of_the_front_constraint(plate: Scene, front: str) -> None:
-    stage = dataclasses.replace(PROFILES["cpu"].stage1, front=front, supervision="projection")
+    stage = dataclasses.replace(recipe("ours", "cpu").stage1, front=front, supervision="projection")
     value = supervise(plate, stage, step=0).loss.item()
     expected = 0.1 * 144 * (56 / 28) ** 2 if front == "emd" else 100 * 0.1
     assert value == pytest.approx(expected, rel=1e-4)
@@ -262,9 +261,9 @@ def test_projection_losses_take_the_unit_of_the_front_constraint(plate: Scene, f
 
 
 def test_every_supervision_has_a_gradient_and_soft_ones_sharpen(plate: Scene) -> None:
-    steps = PROFILES["cpu"].stage1.steps
+    steps = recipe("ours", "cpu").stage1.steps
     for supervision in ("front", "projection", "lin", "soft"):
-        stage = dataclasses.replace(PROFILES["cpu"].stage1, supervision=supervision)
+        stage = dataclasses.replace(recipe("ours", "cpu").stage1, supervision=supervision)
         points = (plate.points + 0.02).requires_grad_()
         logits = torch.full(points.shape[:2], 0.5).requires_grad_()
         found = supervise(plate._replace(points=points, logits=logits), stage, step=steps)
@@ -274,15 +273,15 @@ def test_every_supervision_has_a_gradient_and_soft_ones_sharpen(plate: Scene) ->
         assert (sideways > 1e-4) == (supervision in ("front", "soft")), supervision
         assert (logits.grad is not None) == (supervision == "lin")
         assert ("matched_share" in found.shares) == (supervision == "front")
-    soft = dataclasses.replace(PROFILES["cpu"].stage1, supervision="soft")
+    soft = dataclasses.replace(recipe("ours", "cpu").stage1, supervision="soft")
     early, late = (supervise(plate, soft, step=step).loss.item() for step in (0, steps))
     assert early != late
 
 
 def test_points_that_do_not_exist_are_replaced_by_those_that_do() -> None:
     torch.manual_seed(0)
-    config = dataclasses.replace(PROFILES["smoke"], stage1=_lin(PROFILES["smoke"].stage1))
-    model = build_network(config)
+    config = dataclasses.replace(recipe("ours", "smoke"), stage1=_lin(recipe("ours", "smoke").stage1))
+    model = get_method(config.system).build(config)
     assert isinstance(model, Generator)
     assert isinstance(model.decoder, PointDecoder)
     assert model.config == dataclasses.replace(SIZES["smoke"], existence=True)
@@ -303,14 +302,18 @@ def test_points_that_do_not_exist_are_replaced_by_those_that_do() -> None:
 
 
 def test_supervision_belongs_to_our_own_system(tmp_path: Path) -> None:
-    config = dataclasses.replace(PROFILES["smoke"], system="psgn", stage1=_lin(PROFILES["smoke"].stage1))
+    config = dataclasses.replace(
+        recipe("ours", "smoke"), system="psgn", stage1=_lin(recipe("ours", "smoke").stage1)
+    )
     with pytest.raises(UserError, match="supervision and visibility"):
-        build_network(config)
-    latent = dataclasses.replace(PROFILES["smoke"], ending="latent", stage1=_lin(PROFILES["smoke"].stage1))
+        get_method(config.system).build(config)
+    latent = dataclasses.replace(
+        recipe("ours", "smoke"), output_head="latent", stage1=_lin(recipe("ours", "smoke").stage1)
+    )
     with pytest.raises(UserError, match="leave --ending at points"):
-        build_network(latent)
+        get_method(latent.system).build(latent)
     with pytest.raises(ValueError, match="existence needs"):
-        build_generator(config=dataclasses.replace(SIZES["smoke"], existence=True, ending="latent"))
+        build_generator(config=dataclasses.replace(SIZES["smoke"], existence=True, output_head="latent"))
 
 
 def _lin(stage):
