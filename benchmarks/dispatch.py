@@ -94,11 +94,17 @@ def _bare(module: str) -> ModuleType:
 
 
 def _register_bare(
-    name: str, *, fake: Callable, backward: Callable | None = None, setup: Callable | None = None
+    name: str,
+    *,
+    fake: Callable,
+    backward: Callable | None = None,
+    setup: Callable | None = None,
+    strided: bool = False,
 ) -> Callable[[Callable], Callable]:
-    """Stands in for `_bridge.register`."""
+    """Replaces `_bridge.register`: an `autograd.Function` instead of a torch operator."""
 
     def decorate(function: Callable) -> Callable:
+        function = _bridge._on_cpu_tensors(function, strided)
         if backward is None or setup is None:
             return function
         members = SimpleNamespace(

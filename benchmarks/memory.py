@@ -149,7 +149,6 @@ def _cases() -> Iterator[Case]:
         with_gradient(lambda x, camera: dp.splat_depth(x, camera).depth.clamp(max=9)),
     )
     yield rendered("sample_view", lambda x, camera: dp.sample_view(x, dp.splat_depth(x, camera)))
-    yield rendered("visible_points, cone", lambda x, camera: dp.visible_points(x, camera, method="cone"))
     yield rendered(
         "visible_points, horizon", lambda x, camera: dp.visible_points(x, camera, method="horizon")
     )

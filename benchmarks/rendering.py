@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,8 +15,8 @@ from benchmarks.harness import Contender, Race
 from benchmarks.inputs import circle_of_cameras, depth_maps, gradient, leaf, leaf_camera, surfaces
 from benchmarks.peers import each, optional
 from diffpoint import reference
-from diffpoint._horizon import BIAS, FILTERS
-from diffpoint.visibility import _DEFAULTS, METHODS, Method
+from diffpoint._horizon import FILTERS
+from diffpoint.visibility import _DEFAULTS, METHODS, Method, _limit
 
 Leaves = tuple[Any, ...]
 """Points or depths, then the cameras that see them, whose gradients a run leaves behind."""
@@ -202,13 +201,11 @@ def _visible(count: int, n: int, size: int, method: Method) -> Race:
         peers += _open3d_hidden(points, camera)
     else:
         radius, tolerance = _DEFAULTS[method]
-        if method == "horizon":
-            tolerance = math.log(tolerance / (1 - tolerance)) - BIAS
         one = points[:1], camera.K[:1], camera.cam_from_world[:1], (size, size)
-        twin = lambda: reference.visible_points(  # noqa: E731
-            *one, method=method, radius=radius, tolerance=tolerance, filters=torch.tensor(FILTERS)
+        in_torch = lambda: reference.visible_points(  # noqa: E731
+            *one, filters=torch.tensor(FILTERS), radius=radius, limit=_limit(tolerance)
         )
-        peers.append(Contender("torch", twin, lambda visible: visible.float(), units=1))
+        peers.append(Contender("torch", in_torch, lambda visible: visible.float(), units=1))
     ours = lambda: dp.visible_points(points, camera, method=method)  # noqa: E731
     return Race(
         f"visible_points, {method}",

@@ -35,9 +35,6 @@ SIZES = (28, 32, 40, 56, 112, 224)
 HEADLINE = 56
 MARK = {"hidden": 0.05, "recall": 0.75, "ratio": 3.0}
 SWEEPS: dict[Method, tuple[str, tuple[float, ...]]] = {
-    "radius": ("tolerance", (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)),
-    "pyramid": ("tolerance", (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)),
-    "cone": ("tolerance", (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)),
     "horizon": ("tolerance", (0.03, 0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5, 0.7)),
     "hpr": ("radius", (1.0, 1.25, 1.5, 1.75, 2.0, 2.5)),
 }
@@ -220,9 +217,7 @@ def figure(result: dict[str, Any], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    colours = dict(
-        zip(METHODS, ("#777777", "#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2"), strict=True)
-    )
+    colours = {"zbuffer": "#777777", "horizon": "#d55e00", "hpr": "#0072b2"}
     figure, panels = pyplot.subplots(1, len(COUNTS), figsize=(12, 5.2), sharey=True)
     for panel, count in zip(panels, COUNTS, strict=True):
         spent = {r["method"]: r for r in result["time"] if r["points"] == count}

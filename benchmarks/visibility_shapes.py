@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from train.data.categories import category_of
+from train.data.mesh_sources import find_meshes, keep_labelled, read_labels
 from train.data.meshes import MeshError, load_surface
-from train.data.sources import find_meshes, keep_labelled, read_labels
 from train.data.surface import Surface, sample_triangles
 from train.experiments.hidden_points import EPSILON, Rays, Scene, embedded_scene, make_scene
 

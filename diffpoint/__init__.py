@@ -5,10 +5,12 @@ from diffpoint.camera import PinholeCamera, PointSets, Projection
 from diffpoint.distances import Chamfer, Nearest, chamfer_distance, nearest
 from diffpoint.losses import (
     FrontSets,
+    FrontTerms,
     consistency_loss,
     diversity_loss,
     front_constraint,
     front_sets,
+    front_terms,
 )
 from diffpoint.projection import projection_loss, soft_projection_loss
 from diffpoint.reproject import Reprojection, project, reproject, unproject
@@ -25,6 +27,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Chamfer",
     "FrontSets",
+    "FrontTerms",
     "Nearest",
     "PinholeCamera",
     "PointSets",
@@ -44,6 +47,7 @@ __all__ = [
     "farthest_point_sample",
     "front_constraint",
     "front_sets",
+    "front_terms",
     "nearest",
     "project",
     "projection_loss",

@@ -1,11 +1,11 @@
-"""Taichi's life: started on the first op and only if nobody has, never restarted, refused after a fork."""
+"""Starts Taichi at the first op unless the host program has; never restarts it, and refuses to use it after a fork."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import importlib
-import importlib.util
+import inspect
 import io
 import os
 import platform
@@ -13,13 +13,15 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
+from diffpoint._backend import BACKENDS, backend_name, import_backend
 from diffpoint._launch import FastCall
 
 # Taichi runs a parallel loop of up to 512 iterations on one thread unless it was started with other settings.
-# In a host program's Taichi every loop is therefore stretched by this factor, and acts once per stretch.
+# Where the host program started Taichi, every loop therefore has this many times the iterations, of which one in so
+# many does work.
 _HOST_SPREAD = 512
 
 
@@ -36,9 +38,9 @@ class RuntimeInfo:
     """Who started Taichi: "diffpoint", "host" or "nobody"."""
     threads: int
     cache: bool
-    """Whether compiled kernels are kept on disk for the next process."""
+    """Whether compiled kernels are cached on disk for later processes."""
     processor: str
-    """Name of the processor, as far as the system tells it: what times belong to."""
+    """Name of the processor, if the system reports it, to label measured times with."""
 
 
 class _Runtime:
@@ -51,15 +53,9 @@ class _Runtime:
         self.kernels: dict[tuple[str, str], SimpleNamespace] = {}
         self.calls: dict[tuple[str, str, str], FastCall] = {}
 
-    def backend(self) -> ModuleType:
-        name = os.environ.get("DIFFPOINT_BACKEND", "")
-        if name not in ("", "taichi", "quadrants"):
-            raise RuntimeError(f"diffpoint: DIFFPOINT_BACKEND must be 'taichi' or 'quadrants'; got {name!r}.")
-        return _quiet_import(name or _installed_backend())
-
     def current_program(self) -> Any:
-        """The running Taichi program, whoever started it; None before any."""
-        backend = sys.modules.get("taichi") or sys.modules.get("quadrants")
+        """The running Taichi program, started here or by the host; None before."""
+        backend = sys.modules.get(backend_name())
         if backend is None:
             return None
         runtime = backend.lang.impl.get_runtime()
@@ -68,7 +64,7 @@ class _Runtime:
         )  # quadrants' `prog` raises before a start
 
     def ensure_started(self) -> int:
-        """Start Taichi if nobody has. Returns the spread factor of parallel loops."""
+        """Start Taichi unless it runs. Returns the spread factor of parallel loops (see kernels/__init__.py)."""
         if self.forked:
             raise RuntimeError(
                 "diffpoint: this process was forked after Taichi had started, and Taichi's threads do not survive a "
@@ -81,15 +77,15 @@ class _Runtime:
         return 1 if program is self.program else _HOST_SPREAD
 
     def _start(self) -> Any:
-        ti = self.backend()
-        with contextlib.redirect_stdout(io.StringIO()):  # init announces itself on stdout
+        ti = import_backend()
+        with contextlib.redirect_stdout(io.StringIO()):  # init prints its version
             ti.init(
                 arch=ti.cpu,
                 log_level=ti.ERROR,
                 cpu_max_num_threads=self.threads or available_threads(),
                 offline_cache=self.cache,
-                fast_math=False,  # it assumes that there is no infinity, and infinity marks empty pixels
-                # Even two iterations of a parallel loop are shared out among the threads.
+                fast_math=False,  # it would assume that there are no infinities, but empty pixels are +inf
+                # With these, a parallel loop of two iterations already runs on two threads.
                 make_cpu_multithreading_loop=False,
                 default_cpu_block_dim=1,
             )
@@ -100,39 +96,26 @@ class _Runtime:
         """The kernels of `diffpoint.kernels.<module>` for "f32" or "f64"."""
         key = (module, real)
         if key not in self.kernels:
-            ti = self.backend()
+            ti = import_backend()
             self.kernels[key] = importlib.import_module(f"diffpoint.kernels.{module}").build(
                 getattr(ti, real)
             )
         return self.kernels[key]
 
     def call(self, module: str, kernel: str, real: str) -> FastCall:
-        """One of these kernels, to be called without Taichi's overhead."""
+        """One of these kernels, with less overhead than Taichi's own call."""
         key = (module, kernel, real)
         if key not in self.calls:
             self.calls[key] = FastCall(getattr(self.kernel(module, real), kernel))
         return self.calls[key]
 
-
-def _installed_backend() -> str:
-    for name in ("taichi", "quadrants"):
-        if name in sys.modules or importlib.util.find_spec(name) is not None:
-            return name
-    raise ImportError(
-        "diffpoint: neither taichi nor quadrants is installed. Install one: pip install taichi."
-    )
-
-
-def _quiet_import(name: str) -> ModuleType:
-    if name not in sys.modules:
-        for backend in ("TAICHI", "QUADRANTS"):
-            os.environ.setdefault(f"ENABLE_{backend}_HEADER_PRINT", "0")
-        os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # it would start a thread and use the network
-    return importlib.import_module(name)
+    def argument_name(self, module: str, kernel: str, position: int) -> str:
+        """Name of an argument in the kernel's source, for error messages."""
+        return list(inspect.signature(getattr(self.kernel(module, "f32"), kernel)).parameters)[position]
 
 
 def available_threads() -> int:
-    """Cores this process may use."""
+    """Number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -142,9 +125,9 @@ RUNTIME = _Runtime()
 
 
 def _mark_forked() -> None:
-    if RUNTIME.current_program() is not None:
+    if any(name in sys.modules for name in BACKENDS) and RUNTIME.current_program() is not None:
         RUNTIME.forked = True
-    RUNTIME.lock = threading.RLock()  # another thread of the parent may have held it
+    RUNTIME.lock = threading.RLock()  # another thread of the parent may have held the old one
 
 
 if hasattr(os, "register_at_fork"):
@@ -152,14 +135,14 @@ if hasattr(os, "register_at_fork"):
 
 
 def configure(*, threads: int | None = None, cache: bool = True) -> None:
-    """Settings of the kernels' runtime; call it before the first op.
+    """Set how the kernels run; call it before the first op.
 
     Args:
-        threads: how many threads the kernels use; None means every core this process may use.
-        cache: keep compiled kernels on disk, so that the next process starts in a fraction of a second.
+        threads: number of threads of the kernels; None means every core that this process may use.
+        cache: cache compiled kernels on disk, so that the next process starts in a fraction of a second.
 
     Raises:
-        RuntimeError: an op has already started the kernels (Taichi cannot be started twice in a process).
+        RuntimeError: an op has run already (Taichi cannot be started twice in a process).
         ValueError: fewer than one thread.
 
     Example:
@@ -187,7 +170,7 @@ def runtime_info() -> RuntimeInfo:
         True
     """
     with RUNTIME.lock:
-        ti = RUNTIME.backend()
+        ti = import_backend()
         program = RUNTIME.current_program()
         if program is None:
             owner, threads = "nobody", RUNTIME.threads or available_threads()
@@ -205,9 +188,9 @@ def runtime_info() -> RuntimeInfo:
         )
 
 
-@functools.cache  # `runtime_info` is asked at every splat
+@functools.cache  # `runtime_info` is called at every splat
 def _processor_name() -> str:
-    cpuinfo = Path("/proc/cpuinfo")  # Linux, where `platform` does not know the name
+    cpuinfo = Path("/proc/cpuinfo")  # on Linux `platform` does not return the name
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()

@@ -1,7 +1,7 @@
-"""The paper's losses on point clouds. The projection losses they are compared with: `projection.py`.
+"""The paper's losses on point clouds. The projection losses that it compares with are in `projection.py`.
 
 All return a tensor: with reduction="mean" a scalar, with "none" one value per item. Distances are un-squared means in
-the unit of the clouds; the paper's sums and factors of 100 are applied where its tables are made.
+the unit of the clouds; the paper's sums and factors of 100 are not applied here.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from diffpoint.views import sample_view
 from diffpoint.visibility import Method, visible_points
 
 Reduction = Literal["mean", "none"]
+Distance = Literal["chamfer", "emd"]
 
 
 class FrontSets(NamedTuple):
-    """What each view shows of the predicted cloud, and of the truth."""
+    """The visible points of the predicted cloud and the points of the true depth map, for each view."""
 
     predicted: Tensor
     """(B, V, M, 3) world frame: the predicted points that the view sees, then padding."""
@@ -37,7 +38,7 @@ class FrontSets(NamedTuple):
     observed_lengths: Tensor
     """(B, V) int64; 0 for an empty depth map."""
     fallback: Tensor
-    """(B, V) bool: no predicted point was visible, so the whole cloud stands in and is pulled into view."""
+    """(B, V) bool: no predicted point was visible, so `predicted` is the whole cloud."""
 
 
 def front_sets(
@@ -78,17 +79,106 @@ def front_sets(
     return FrontSets(seen, lengths, observed[:, :, :longest], observed_lengths, fallback)
 
 
+class FrontTerms(NamedTuple):
+    """The front constraint of each view, and how many points it compared."""
+
+    loss: Tensor
+    """(B, V) world units; 0, with gradient 0, where the depth map is empty."""
+    matched: Tensor
+    """(B, V) int64: size of the smaller of the two sets, which is the number of pairs of an assignment between them."""
+    observed: Tensor
+    """(B, V) int64: number of points of the depth map."""
+    fallback: Tensor
+    """(B, V) bool: no predicted point was visible though the depth map is not empty; the whole cloud was compared."""
+
+
+def front_terms(
+    points: Tensor,
+    camera: PinholeCamera,
+    depth: Tensor,
+    *,
+    distance: Distance = "chamfer",
+    tolerance: float = 0.02,
+    visibility: Method = "zbuffer",
+) -> FrontTerms:
+    """The front constraint of each view, before reduction and without warnings; see `front_constraint`.
+
+    Args:
+        points: (B, N, 3) predicted clouds in the world.
+        camera: batch shape (), (V,) or (B, V), of the depth maps' size.
+        depth: (B, V, H, W) true depth maps, +inf where empty.
+        distance: "chamfer": sum of both directions' mean distances; "emd": mean distance of the assignment. The sum
+            over matched points, as in the paper, is `loss * matched`.
+        tolerance: of the earth mover's distance.
+        visibility: how the predicted points that a view sees are found; a method of `visible_points`.
+
+    Gradients: of `loss` to x, y and z of the visible points, and to `depth` and the camera; none through the choice
+        of the points.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, an unknown distance, a cloud without points, NaN or
+            infinite coordinates.
+
+    Example:
+        >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
+        >>> depth = torch.full((1, 2, 4, 4), float("inf")); depth[0, 0, 1, 1] = 2.0
+        >>> terms = front_terms(torch.zeros(1, 5, 3), camera, depth)
+        >>> terms.matched.tolist(), terms.observed.tolist(), terms.loss[0, 1].item()
+        ([[1, 0]], [[1, 0]], 0.0)
+    """
+    return _front_terms("front_terms", points, camera, depth, distance, tolerance, visibility)
+
+
+def _front_terms(
+    function: str,
+    points: Tensor,
+    camera: PinholeCamera,
+    depth: Tensor,
+    distance: Distance,
+    tolerance: float,
+    visibility: Method,
+) -> FrontTerms:
+    _checks.check_choice(function, "distance", distance, ("chamfer", "emd"))
+    sets = front_sets(points, camera, depth, visibility=visibility)
+    if points.shape[1] == 0:
+        raise _checks.fail(function, "points", "hold at least one point", str(tuple(points.shape)))
+    kept = sets.observed_lengths > 0
+    if not bool(kept.any()):
+        # Depends on `points`, so that the backward pass of such a batch gives zeros and does not fail.
+        loss = points.new_zeros(kept.shape) + (0 * points).sum()
+    elif bool(kept.all()):
+        loss = _compare_sets(sets, distance, tolerance)
+    else:
+        compared = _compare_sets(FrontSets(*(value[kept] for value in sets)), distance, tolerance)
+        loss = points.new_zeros(kept.shape).masked_scatter(kept, compared)
+    return FrontTerms(
+        loss,
+        sets.predicted_lengths.minimum(sets.observed_lengths),
+        sets.observed_lengths,
+        sets.fallback & kept,
+    )
+
+
+def _compare_sets(sets: FrontSets, distance: Distance, tolerance: float) -> Tensor:
+    """(*B) distances between sets that all hold at least one point."""
+    a, b, a_lengths, b_lengths = sets.predicted, sets.observed, sets.predicted_lengths, sets.observed_lengths
+    if distance == "chamfer":
+        both = chamfer_distance(a, b, squared=False, a_lengths=a_lengths, b_lengths=b_lengths)
+        return both.a_to_b + both.b_to_a
+    return earth_mover_distance(a, b, tolerance=tolerance, a_lengths=a_lengths, b_lengths=b_lengths).cost
+
+
 def front_constraint(
     points: Tensor,
     camera: PinholeCamera,
     depth: Tensor,
     *,
-    distance: Literal["chamfer", "emd"] = "chamfer",
+    distance: Distance = "chamfer",
     tolerance: float = 0.02,
     visibility: Method = "zbuffer",
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """distance(points that each view sees, points of its true depth map), in 3D.
+    """distance(predicted points that a view sees, points of its true depth map), in 3D, for each view.
 
     Args:
         points: (B, N, 3) predicted clouds in the world.
@@ -101,14 +191,15 @@ def front_constraint(
         reduction: "mean" over all views, or "none" for (B, V).
 
     Returns:
-        The loss in world units. A view whose depth map is empty constrains nothing: it counts 0. A view in which no
-        predicted point is visible compares the whole cloud instead, so that it is pulled in; both raise a
-        `RuntimeWarning`.
+        The loss in world units. A view whose depth map is empty has loss 0. In a view in which no predicted point is
+        visible the whole cloud is compared, which pulls it into view. Both raise a `RuntimeWarning`; `front_terms`
+        returns them instead.
 
     Gradients: to x, y and z of the visible points; none through the choice of the points.
 
     Raises:
-        ValueError, TypeError: wrong shapes, dtypes or devices, an unknown distance, NaN or infinite coordinates.
+        ValueError, TypeError: wrong shapes, dtypes or devices, an unknown distance, a cloud without points, NaN or
+            infinite coordinates.
 
     Source: CVPR 2019 paper, front constraint (section 3.2).
 
@@ -121,14 +212,10 @@ def front_constraint(
         >>> same < shifted  # not 0: the points of a pixel are compared with its centre
         True
     """
-    _checks.check_choice("front_constraint", "distance", distance, ("chamfer", "emd"))
-    sets = front_sets(points, camera, depth, visibility=visibility)
-    if points.shape[1] == 0:
-        raise _checks.fail("front_constraint", "points", "hold at least one point", str(tuple(points.shape)))
-    empty = sets.observed_lengths == 0
+    terms = _front_terms("front_constraint", points, camera, depth, distance, tolerance, visibility)
     for happened, what in (
-        (sets.fallback & ~empty, "no predicted point is visible"),
-        (empty, "the depth map is empty"),
+        (terms.fallback, "no predicted point is visible"),
+        (terms.observed == 0, "the depth map is empty"),
     ):
         if bool(happened.any()):
             where = tuple(happened.nonzero()[0].tolist())
@@ -138,37 +225,20 @@ def front_constraint(
                 RuntimeWarning,
                 stacklevel=2,
             )
-    loss = points.new_zeros(empty.shape)
-    kept = ~empty
-    if bool(kept.any()):
-        seen, observed = sets.predicted[kept], sets.observed[kept]
-        seen_lengths, observed_lengths = sets.predicted_lengths[kept], sets.observed_lengths[kept]
-        if distance == "chamfer":
-            both = chamfer_distance(
-                seen, observed, squared=False, a_lengths=seen_lengths, b_lengths=observed_lengths
-            )
-            value = both.a_to_b + both.b_to_a
-        else:
-            value = earth_mover_distance(
-                seen, observed, tolerance=tolerance, a_lengths=seen_lengths, b_lengths=observed_lengths
-            ).cost
-        loss = loss.masked_scatter(kept, value)
-    else:
-        loss = loss + 0 * points.sum()  # a gradient of 0, so that a step on such a batch does not fail
-    return reduce_loss("front_constraint", loss, reduction)
+    return reduce_loss("front_constraint", terms.loss, reduction)
 
 
 def diversity_loss(
     codes: Tensor, clouds: Tensor, *, alpha: float, tolerance: float = 0.05, reduction: Reduction = "mean"
 ) -> Tensor:
-    """mean over pairs i < j of relu(|r_i - r_j| - alpha EMD(S_i, S_j)): different codes, different shapes.
+    """mean over pairs i < j of relu(|r_i - r_j| - alpha EMD(S_i, S_j)): different codes must give different shapes.
 
     Args:
-        codes: (R, B, D) random inputs.
-        clouds: (R, B, N, 3) the shapes they gave, world frame.
-        alpha: how much distance between shapes a distance between codes asks for, per unit of the mean earth mover's
-            distance. The paper's 0.2 and 0.1 multiply a sum over 2048 points of an approximation that is about 1.3
-            times the distance: here they are 0.2 * 2048 * 1.3 and 0.1 * 2048 * 1.3.
+        codes: (R, B, D) random inputs of a generator.
+        clouds: (R, B, N, 3) the shapes generated from them, world frame.
+        alpha: weight of the distance between shapes, the mean earth mover's distance. The paper's 0.2 and 0.1 multiply
+            a sum over 2048 points of an approximation that is about 1.3 times the distance; here they correspond to
+            0.2 * 2048 * 1.3 and 0.1 * 2048 * 1.3.
         tolerance: of the earth mover's distance.
         reduction: "mean" over all, or "none" for (B,).
 
@@ -193,14 +263,14 @@ def diversity_loss(
         _checks.check_finite("diversity_loss", "codes", codes.detach())
     first, second = _pairs("diversity_loss", "codes", codes.shape[0])
     apart = (codes[first] - codes[second]).norm(dim=-1)
-    # Shapes that have been proven to differ enough cost nothing, however much they differ.
+    # From this distance on the hinge is 0, so the exact distance is not needed.
     enough = apart / alpha if alpha > 0 else None
     moved = earth_mover_distance(clouds[first], clouds[second], tolerance=tolerance, enough=enough).cost
     return reduce_loss("diversity_loss", torch.relu(apart - alpha * moved).mean(0), reduction)
 
 
 def consistency_loss(clouds: Tensor, *, reduction: Reduction = "mean") -> Tensor:
-    """mean over pairs i < j of the chamfer distance between S_i and S_j: how far predictions disagree.
+    """mean over pairs i < j of the chamfer distance between S_i and S_j, predictions of one shape.
 
     Args:
         clouds: (*B, V, N, 3) V predictions of each shape, world frame.
@@ -227,7 +297,7 @@ def consistency_loss(clouds: Tensor, *, reduction: Reduction = "mean") -> Tensor
 
 
 def _pairs(function: str, argument: str, count: int) -> tuple[list[int], list[int]]:
-    """All i < j below `count`."""
+    """All i < j < `count`, as the list of i and the list of j."""
     if count < 2:
         raise _checks.fail(function, argument, "hold at least two to compare", str(count))
     first, second = zip(*itertools.combinations(range(count), 2), strict=True)
@@ -235,7 +305,7 @@ def _pairs(function: str, argument: str, count: int) -> tuple[list[int], list[in
 
 
 def check_maps(function: str, points: Tensor, camera: PinholeCamera, depth: Tensor) -> tuple[int, int]:
-    """(B, V) of depth maps that fit the clouds and the cameras."""
+    """Check depth maps against clouds and cameras; returns (B, V)."""
     _checks.check_clouds(function, "points", points)
     _checks.check_tensor(function, "depth", depth, (points.shape[0], "V", camera.height, camera.width))
     _checks.check_same_dtype(function, points=points, depth=depth)

@@ -1,9 +1,9 @@
-"""Which points of a cloud a camera sees: the paper's z-buffer, and tests that see more and err less."""
+"""Which points of a cloud a camera sees: the paper's z-buffer, and more accurate methods."""
 
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -14,18 +14,11 @@ from diffpoint._runtime import runtime_info
 from diffpoint.camera import PinholeCamera, check_views
 from diffpoint.splat import splat_depth
 
-Method = Literal["zbuffer", "radius", "pyramid", "cone", "horizon", "hpr"]
-METHODS: tuple[Method, ...] = ("zbuffer", "radius", "pyramid", "cone", "horizon", "hpr")
+Method = Literal["zbuffer", "horizon", "hpr"]
+METHODS: tuple[Method, ...] = get_args(Method)
 
-# radius and tolerance of each method, where the caller gives none
-_DEFAULTS = {
-    "zbuffer": (0.0, 0.0),
-    "radius": (2.0, 1.5),
-    "pyramid": (4.0, 2.0),
-    "cone": (3.0, 0.4),
-    "horizon": (REACH, 0.22),
-    "hpr": (1.5, 0.0),
-}
+# radius and tolerance where the caller gives none
+_DEFAULTS = {"zbuffer": (0.0, 0.0), "horizon": (REACH, 0.22), "hpr": (1.5, 0.0)}
 
 
 def visible_points(
@@ -41,22 +34,20 @@ def visible_points(
 
     | method | a point is visible if |
     |---|---|
-    | zbuffer | it owns a pixel (the paper's) |
-    | radius | it lies at most `tolerance` behind the nearest point within `radius` of its pixel |
-    | pyramid | it owns a pixel, at most `tolerance` behind the nearest in a block of pixels of side `radius` |
-    | cone | it owns a pixel, and at most the share `tolerance` of 8 sectors, as long as `radius`, is closed before it |
-    | horizon | its horizons among the points within `radius` say: hidden with probability `tolerance` at most |
+    | zbuffer | it is the nearest point of a pixel, as in the paper |
+    | horizon | the points within `radius` of it in the image hide it with a probability of at most `tolerance` |
     | hpr | it is a corner of the hull of the cloud flipped on a sphere 10^`radius` times as large (needs scipy) |
 
-    Lengths are multiples of the points' spacing in the view, which is estimated from them, so that the defaults hold
-    for any N. zbuffer, radius, pyramid and cone also depend on the size of the map; horizon and hpr do not.
+    "horizon" finds the most visible points and lets the fewest hidden ones through (docs/visibility.md). Only "zbuffer"
+    depends on the size of the map.
 
     Args:
         points: (B, N, 3) in the world.
         camera: batch shape (), (V,) or (B, V); points outside its frame are not visible.
         method: see the table.
-        radius: see the table; default: chosen for the method.
-        tolerance: see the table; larger keeps more visible and more hidden points. Default: chosen for the method.
+        radius: of "horizon", in multiples of the points' spacing in the view, which is estimated from them, so that the
+            default holds for any N; of "hpr", an exponent. Default: chosen for the method.
+        tolerance: of "horizon": larger keeps more visible and more hidden points. Default: 0.22.
         lengths: (B,) int64, how many of the N points count; default all.
 
     Returns:
@@ -69,9 +60,8 @@ def visible_points(
             or infinite coordinates.
         ImportError: method "hpr" without scipy.
 
-    Source: zbuffer: CVPR 2019 paper, section 3.2; cone: Pintus, Gobbetti, Agus, "Real-time rendering of massive
-        unstructured raw point clouds using screen-space operators" (VAST 2011); hpr: Katz, Tal, Basri, "Direct
-        visibility of point sets" (SIGGRAPH 2007); horizon: this library's, see docs/visibility.md.
+    Source: zbuffer: CVPR 2019 paper, section 3.2; hpr: Katz, Tal, Basri, "Direct visibility of point sets" (SIGGRAPH
+        2007); horizon: this library's, see docs/visibility.md.
 
     Example:
         >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
@@ -80,7 +70,7 @@ def visible_points(
         [[[False, True]]]
     """
     _checks.check_clouds("visible_points", "points", points)
-    _checks.check_choice("visible_points", "method", method, tuple(_DEFAULTS))
+    _checks.check_choice("visible_points", "method", method, METHODS)
     for name, value in (("radius", radius), ("tolerance", tolerance)):
         if value is not None and not 0 <= value < math.inf:
             raise _checks.fail("visible_points", name, "be a finite number, at least 0", repr(value))
@@ -127,50 +117,40 @@ def _visible(
     if method == "hpr":
         return _on_flipped_hull(points, lengths, projection, height, width, radius)
     visible = torch.empty(shape, dtype=torch.uint8)
-    # Views take turns in the working memory of a few workers: fresh memory for each would cost as much as the work.
+    # Views share the memory of a few workers: allocating memory for each view would take as long as the kernel.
     workers = min(shape[0] * shape[1], 4 * runtime_info().threads)
-    inputs = points.reshape(-1), lengths, projection.reshape(-1)
-    image = points.new_empty(workers * count * 3)
     cells = torch.empty(workers * (8 * count + 32), dtype=torch.int32)
-    sizes = workers, shape[1], count, height, width
-    if method == "horizon":
-        kernel, last = "horizon", _limit(tolerance)
-        filters = torch.tensor(FILTERS, dtype=points.dtype).view(-1)
-        row = count + 17  # a register's worth of padding, and a place for what is left out
-        scratch = (
-            torch.empty(workers * count, dtype=torch.int32),
-            points.new_empty(cells.shape),
-            torch.empty(workers * row, dtype=torch.int32),
-            points.new_empty(workers * row * 3),
-            filters,
-        )
-    else:
-        depth = points.new_empty(workers * height * width)
-        owner = torch.empty(workers * height * width, dtype=torch.int32)
-        kernel, last = {"radius": "slab"}.get(method, method), tolerance
-        scratch = {
-            "radius": (depth,),
-            "pyramid": (depth, owner, torch.empty_like(depth)),
-            "cone": (depth, owner),
-        }[method]
+    row = (
+        count + 17
+    )  # padding of one vector register, and one place that collects the points that are left out
     _bridge.launch(
         "visibility",
-        kernel,
+        "horizon",
         points.dtype,
-        *inputs,
-        image,
+        points.reshape(-1),
+        lengths,
+        projection.reshape(-1),
+        points.new_empty(workers * count * 3),
         cells,
-        *scratch,
+        torch.empty(workers * count, dtype=torch.int32),
+        points.new_empty(cells.shape),
+        torch.empty(workers * row, dtype=torch.int32),
+        points.new_empty(workers * row * 3),
+        torch.tensor(FILTERS, dtype=points.dtype).view(-1),
         visible.view(-1),
-        *sizes,
+        workers,
+        shape[1],
+        count,
+        height,
+        width,
         radius,
-        last,
+        _limit(tolerance),
     )
     return visible.view(torch.bool)
 
 
 def _limit(probability: float) -> float:
-    """The score of the filters at which a point is hidden with this probability."""
+    """The score of the filters at which a point is hidden with the given probability."""
     p = min(max(probability, 1e-6), 1 - 1e-6)
     return math.log(p / (1 - p)) - BIAS
 

@@ -1,7 +1,7 @@
-"""The auto-encoder of point clouds: its code space is where the critic compares predictions with real shapes.
+"""The auto-encoder of point clouds: the critic compares predicted with real shapes in its latent space.
 
-The encoder sees every point alone and keeps, for each of the code's numbers, the largest answer of any point:
-a code describes a set, whatever the order and number of its points.
+The encoder is a PointNet: the same layers for every point, then a maximum over the points for each latent dimension.
+A code therefore does not depend on the order of the points, and their number may vary.
 """
 
 from __future__ import annotations
@@ -74,23 +74,23 @@ class Autoencoder(nn.Module):
                 _xavier(module)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Writes a cloud down as a code and reads it again: (B, P, 3) -> (B, N, 3)."""
+        """Encodes and decodes: (B, P, 3) -> (B, N, 3)."""
         return self.decode(self.encode(points))
 
     def encode(self, points: Tensor) -> Tensor:
         """(B, P, 3) points, any P >= 1 -> (B, LATENT_DIM)."""
-        return self._answers(points).amax(1)
+        return self._features(points).amax(1)
 
     def freeze(self) -> Autoencoder:
-        """Ends its training: eval mode, with the running statistics of its batch norms, and no gradients."""
+        """Switches to eval mode (running statistics in batch norms) and turns gradients of its weights off."""
         return self.eval().requires_grad_(False)
 
     def encode_frozen(self, points: Tensor) -> Tensor:
-        """`encode` in half of the time and a fraction of the memory, for a network that only passes gradients on.
+        """`encode` of a frozen network, with gradients to the points, in half the time and a fraction of the memory.
 
-        The points that set the code's numbers are found without a graph, a few clouds at a time so that their
-        features stay in the cache; then those points alone pass once more. Batch norms are folded into the layers
-        before them. Requires eval mode: with batch statistics, all points take part.
+        First the point with the maximum of each latent dimension is found without a graph, a few clouds at a time so
+        that their features stay in the cache; then these points alone are encoded with a graph. Batch norms are folded
+        into the layers before them. Requires eval mode: batch statistics would depend on all points.
         """
         if self.training:
             raise RuntimeError(
@@ -99,16 +99,16 @@ class Autoencoder(nn.Module):
         layers = self._folded()
         at_once = max(1, _CACHED_POINTS // points.shape[1])
         with torch.no_grad():
-            # (B, LATENT_DIM) each: the largest answer to every number of the code, and whose it is.
-            largest = [_pass(layers, some).max(1) for some in points.split(at_once)]
-            deciding = torch.cat([found.indices for found in largest])
+            # (B, LATENT_DIM) each: the maximum over points, and the point that has it.
+            maxima = [_point_features(layers, some).max(1) for some in points.split(at_once)]
+            deciding = torch.cat([found.indices for found in maxima])
         if not points.requires_grad:
-            return torch.cat([found.values for found in largest])
+            return torch.cat([found.values for found in maxima])
         chosen = torch.take_along_dim(points, deciding[..., None], 1)
-        return _pass(layers, chosen).diagonal(dim1=1, dim2=2)
+        return _point_features(layers, chosen).diagonal(dim1=1, dim2=2)
 
     def _folded(self) -> list[tuple[Tensor, Tensor]]:
-        """Weight (in, out) and bias of every layer with the batch norm behind it."""
+        """Weight (in, out) and bias of every layer, with the following batch norm folded in."""
         folded = []
         modules = list(self.each_point)
         for linear, norm in zip(modules[::3], modules[1::3], strict=True):
@@ -121,12 +121,12 @@ class Autoencoder(nn.Module):
             folded.append(((linear.weight * scale[:, None]).t(), bias))
         return folded
 
-    def _answers(self, points: Tensor) -> Tensor:
-        """(B, P, 3) -> (B, P, LATENT_DIM): what each point says to each number of the code."""
+    def _features(self, points: Tensor) -> Tensor:
+        """(B, P, 3) -> (B, P, LATENT_DIM): features of each point, of which the code is the maximum."""
         return self.each_point(points.reshape(-1, 3)).unflatten(0, points.shape[:2])
 
 
-def _pass(layers: list[tuple[Tensor, Tensor]], points: Tensor) -> Tensor:
+def _point_features(layers: list[tuple[Tensor, Tensor]], points: Tensor) -> Tensor:
     """(B, P, 3) -> (B, P, LATENT_DIM)."""
     features = points.reshape(-1, 3)
     for weight, bias in layers:

@@ -1,6 +1,6 @@
-"""The critic of the WGAN-GP: a number for a shape's code, high for codes of real shapes.
+"""The critic of the WGAN-GP: a score for a latent code of a shape, high for real shapes.
 
-Its losses are those of Gulrajani et al., "Improved training of Wasserstein GANs" (NeurIPS 2017), on codes.
+The losses are those of Gulrajani et al., "Improved training of Wasserstein GANs" (NeurIPS 2017), on codes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from models.autoencoder import LATENT_DIM
 class Critic(nn.Module):
     """D(z): (*, LATENT_DIM) codes -> (*) scores, unbounded. No batch norm: the penalty is on single codes.
 
-    Only differences of scores mean something: what all of them have in common cancels in every loss, and drifts.
+    Only differences of scores are meaningful: a constant added to all of them cancels in every loss, and drifts.
     """
 
     def __init__(self) -> None:
@@ -31,7 +31,7 @@ class Critic(nn.Module):
 
 
 def critic_loss(real_scores: Tensor, fake_scores: Tensor) -> Tensor:
-    """E[D(z_fake)] - E[D(z_real)], which the critic lowers: minus its estimate of the Wasserstein distance.
+    """E[D(z_fake)] - E[D(z_real)], minimised by the critic: minus its estimate of the Wasserstein distance.
 
     Example:
         >>> critic_loss(real_scores=torch.tensor([3.0, 1.0]), fake_scores=torch.tensor([-1.0])).item()
@@ -41,23 +41,23 @@ def critic_loss(real_scores: Tensor, fake_scores: Tensor) -> Tensor:
 
 
 def generator_loss(fake_scores: Tensor) -> Tensor:
-    """-E[D(z_fake)], which the generator lowers."""
+    """-E[D(z_fake)], minimised by the generator."""
     return -fake_scores.mean()
 
 
 def gradient_penalty(
     critic: Callable[[Tensor], Tensor], real: Tensor, fake: Tensor, *, mix: Tensor
 ) -> Tensor:
-    """E[(|grad D(z)| - 1)^2] at z = z_real + u (z_fake - z_real), which keeps D's slope near one.
+    """E[(|grad D(z)| - 1)^2] at z = z_real + u (z_fake - z_real), which keeps the norm of D's gradient near one.
 
     Args:
         critic: codes (*, D) -> scores (*).
         real: (*, D) codes of real shapes.
-        fake: (*, D) codes of predictions, as many.
-        mix: (*) the u of every pair, from U(0, 1).
+        fake: (*, D) codes of predictions.
+        mix: (*) the u of each pair, from U(0, 1).
 
     Returns:
-        A scalar, differentiable in the critic's parameters; nothing flows to `real` and `fake`.
+        A scalar, differentiable in the critic's parameters; `real` and `fake` get no gradient.
 
     Example:
         >>> unit = torch.tensor([0.6, 0.8])

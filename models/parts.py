@@ -1,4 +1,4 @@
-"""The parts of the generator: the image's trunk, the code's branch, and what follows where they meet."""
+"""The parts of the generator: the image trunk, the code branch, and the decoders of their joined features."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch.nn import functional as F
 from models.autoencoder import LATENT_DIM
 from models.sizes import CODE_DIM, GeneratorConfig
 
-# Renders stand on white and are mostly white: without centring, the constant background drowns the object,
-# and the image trunk can die while the loss still falls (the codes alone then explain the data's mean shape).
+# Renders are mostly white background. Without centring, this constant dominates the activations, and the image trunk
+# can die while the loss still falls (the codes alone then fit the mean shape of the data).
 IMAGE_MEAN, IMAGE_GAIN = 0.9, 3.0
 
 
@@ -24,7 +24,7 @@ def prepare_images(images: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def full_precision(like: Tensor) -> torch.autocast:
-    """A context for layers that write coordinates: bfloat16 would round them to 1/500 of an object's size."""
+    """A context for layers that output coordinates: bfloat16 would round them to 1/500 of an object's size."""
     return torch.autocast(like.device.type, enabled=False)
 
 
@@ -58,7 +58,7 @@ def image_trunk(config: GeneratorConfig) -> nn.Sequential:
 
 
 class CodeBranch(nn.Module):
-    """Spreads a code over the grid: two fully connected layers, then two convolutions."""
+    """Maps a code to features on the grid: two fully connected layers, then two convolutions."""
 
     def __init__(self, config: GeneratorConfig) -> None:
         super().__init__()
@@ -74,8 +74,8 @@ class CodeBranch(nn.Module):
         return self.convs(self.spread(codes).unflatten(1, (3, *self.grid)))
 
 
-class _Narrowing(nn.Module):
-    """Joined features -> two coarser maps, a bottleneck and a vector: what both endings start with."""
+class _Contraction(nn.Module):
+    """Joined features -> two coarser maps, a bottleneck and a vector: the first layers of both decoders."""
 
     def __init__(self, config: GeneratorConfig) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class _Narrowing(nn.Module):
         )
         self.fc_width = hidden[1]
 
-    def narrow(self, joined: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def contract(self, joined: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(B, C, h, w) -> maps of h/2 and h/4, the bottleneck of h/8, a vector of fc_width."""
         x4 = self.down4(joined)
         x5 = self.down5(x4)
@@ -99,20 +99,20 @@ class _Narrowing(nn.Module):
         return x4, x5, bottleneck, self.fc_hidden(bottleneck.flatten(1))
 
 
-class LatentDecoder(_Narrowing):
-    """Joined features -> a code of the auto-encoder of shapes."""
+class LatentDecoder(_Contraction):
+    """Joined features -> a latent code of the auto-encoder of shapes."""
 
     def __init__(self, config: GeneratorConfig) -> None:
         super().__init__(config)
         self.latent = nn.Linear(self.fc_width, LATENT_DIM)
 
     def forward(self, joined: Tensor) -> Tensor:
-        vector = self.narrow(joined)[-1]
+        vector = self.contract(joined)[-1]
         with full_precision(joined):
             return self.latent(vector.float())
 
 
-class PointDecoder(_Narrowing):
+class PointDecoder(_Contraction):
     """Joined features -> points: a fully connected and an up-convolving branch."""
 
     def __init__(self, config: GeneratorConfig) -> None:
@@ -131,12 +131,11 @@ class PointDecoder(_Narrowing):
         self.conv_points = _conv(c64, 2 * self.values)
 
     def forward(self, joined: Tensor) -> Tensor:
-        x4, x5, bottleneck, vector = self.narrow(joined)
+        x4, x5, bottleneck, vector = self.contract(joined)
 
         x = self.merge5(F.relu(_crop(self.up5(bottleneck), x5) + self.skip5(x5)))
         x = self.merge4(F.relu(_crop(self.up4(x), x4) + self.skip4(x4)))
-        # The ReLU before this one sum is in the released network (and in PSGN's); the other two sums have
-        # none.
+        # Only this sum has a ReLU before it, as in the released network and in PSGN.
         x = self.merge3(F.relu(F.relu(_crop(self.up3(x), joined)) + self.skip3(joined)))
         with full_precision(joined):
             fc_points = self.fc_points(vector.float()).unflatten(1, (-1, self.values))
@@ -155,16 +154,16 @@ def _deconv(inputs: int, outputs: int) -> nn.ConvTranspose2d:
 
 
 def _crop(x: Tensor, like: Tensor) -> Tensor:
-    """Drops the last row or column where an odd side was halved and doubled."""
+    """Drops the last row or column where an odd side was halved (rounding up) and doubled."""
     return x[..., : like.shape[-2], : like.shape[-1]]
 
 
 def initialise(network: nn.Module) -> None:
-    """Draws the weights of a network of these parts.
+    """Draws the initial weights of a network of these parts.
 
-    Keeps the second moment of activations through the layers, and starts clouds small, around the origin.
-    A layer followed by a ReLU gets variance 2 / fan-in. The layers whose outputs are summed before one ReLU
-    get half of it. With the defaults of torch the signal of the image fades through the trunk's eleven layers.
+    They keep the second moment of activations constant through the layers, and make the first clouds small, around the
+    origin. A layer followed by a ReLU gets variance 2 / fan-in; layers whose outputs are summed before one ReLU get
+    half of it. With torch's defaults the image's signal would vanish through the trunk's eleven layers.
     """
     summed, final = set(), set()
     for part in network.modules():
@@ -182,7 +181,7 @@ def initialise(network: nn.Module) -> None:
 
 
 def _fan_in(module: nn.Conv2d | nn.ConvTranspose2d | nn.Linear) -> float:
-    """Inputs that reach one output value; strided transposed kernels reach it with a share of their taps."""
+    """Inputs per output value; of a strided transposed kernel only a part of the taps contributes to each."""
     if isinstance(module, nn.Linear):
         return module.in_features
     taps = module.kernel_size[0] * module.kernel_size[1]

@@ -7,7 +7,7 @@ from typing import Literal
 
 CODE_DIM = 128
 
-Ending = Literal["points", "latent"]
+OutputHead = Literal["points", "latent"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,12 +19,12 @@ class GeneratorConfig:
         image_height: height to which every image is resized, a multiple of 8.
         image_width: width to which every image is resized, a multiple of 8.
         trunk_width: factor on the channels of the image trunk and the code branch; 1 is the paper's.
-        decoder_width: factor on the channels behind the point where image and code meet; 1 is the paper's.
-        deterministic: leave the code branch out; codes are accepted and ignored.
-        ending: "points": a fully connected and a convolutional branch make the points (the released network).
-            "latent": the network ends in an auto-encoder's code, and that one's decoder makes the points; it is
-            given by `adopt_decoder` and never trained here (the network of the paper's text).
-        existence: give every point a logit of its existence too, for losses that may delete points.
+        decoder_width: factor on the channels after the joining of image and code; 1 is the paper's.
+        deterministic: without the code branch; codes are accepted and ignored.
+        output_head: "points": a fully connected and a convolutional branch predict the points (the released network).
+            "latent": the network predicts a latent code of the auto-encoder of shapes, whose frozen decoder, set by
+            `adopt_decoder`, computes the points (the network of the paper's text).
+        occupancy_logits: predict for every point a logit of its existence too, for losses that may delete points.
     """
 
     profile: str = "cpu"
@@ -33,8 +33,8 @@ class GeneratorConfig:
     trunk_width: float = 0.5
     decoder_width: float = 0.25
     deterministic: bool = False
-    ending: Ending = "points"
-    existence: bool = False
+    output_head: OutputHead = "points"
+    occupancy_logits: bool = False
 
     def __post_init__(self) -> None:
         if self.image_height % 8 or self.image_width % 8 or min(self.image_height, self.image_width) < 8:
@@ -42,21 +42,23 @@ class GeneratorConfig:
                 "GeneratorConfig: image_height and image_width must be positive multiples of 8; "
                 f"got {self.image_height} x {self.image_width}"
             )
-        if self.ending not in ("points", "latent"):
-            raise ValueError(f"GeneratorConfig: ending must be 'points' or 'latent'; got {self.ending!r}")
-        if self.existence and self.ending == "latent":
+        if self.output_head not in ("points", "latent"):
             raise ValueError(
-                "GeneratorConfig: existence needs ending='points': a decoder of shapes gives no logits"
+                f"GeneratorConfig: output_head must be 'points' or 'latent'; got {self.output_head!r}"
+            )
+        if self.occupancy_logits and self.output_head == "latent":
+            raise ValueError(
+                "GeneratorConfig: occupancy_logits needs output_head='points': the auto-encoder's decoder has no logits"
             )
 
     @property
     def values_per_point(self) -> int:
-        """x, y, z, and the logit of existence if points have one."""
-        return 4 if self.existence else 3
+        """x, y, z, and the occupancy logit if there is one."""
+        return 4 if self.occupancy_logits else 3
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns of the grid on which image and code meet."""
+        """Rows and columns of the feature grid on which image and code are joined."""
         return self.image_height // 8, self.image_width // 8
 
     @property

@@ -7,12 +7,16 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads would slow the kernels
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
+if TYPE_CHECKING:
+    from train.data.batches import LoadedSplit
+
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """How many cases the property tests threw."""
+    """Prints how many cases the property tests tried."""
     passed = terminalreporter.stats.get("passed", [])
     cases = sum(value for report in passed for name, value in report.user_properties if name == "cases")
     if cases:
@@ -30,11 +34,19 @@ def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def train_split(tiny_data: Path) -> LoadedSplit:
+    """The tiny tree's train split, at the sizes of our method's smoke profile."""
+    from train.data.batches import load_split
+
+    return load_split(tiny_data, "train", image_size=(48, 64), map_size=16, progress=False)
+
+
+@pytest.fixture(scope="session")
 def smoke_run(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the smoke profile on the tiny tree: 30 steps of stage 1, 20 of stage 2."""
-    from train.config import PROFILES
+    """A run of the smoke profile on the tiny tree: 20 steps of the auto-encoder, 30 of stage 1, 20 of stage 2."""
+    from train.methods import recipe
     from train.training.trainer import fit
 
     run = tmp_path_factory.mktemp("runs") / "smoke"
-    assert fit(tiny_data, run, PROFILES["smoke"], progress=False)
+    assert fit(tiny_data, run, recipe("ours", "smoke"), progress=False)
     return run

@@ -129,10 +129,10 @@ OPS: dict[str, Callable[[], list[Tensor]]] = {
     "project": projected,
     "unproject": unprojected,
     "reproject": reprojected,
-    "front_constraint": lambda: [
-        *loss(lambda x, depth: dp.front_constraint(x, CAMERAS, depth, distance="chamfer")),
-        *loss(lambda x, depth: dp.front_constraint(x, CAMERAS, depth, distance="emd", visibility="horizon")),
-    ],
+    "front_constraint": lambda: loss(lambda x, depth: dp.front_constraint(x, CAMERAS, depth)),
+    "front_terms": lambda: loss(
+        lambda x, depth: dp.front_terms(x, CAMERAS, depth, distance="emd", visibility="horizon").loss
+    ),
     "front_sets": lambda: [*dp.front_sets(clouds(3, 600, 4), CAMERAS, maps()[0].detach())],
     "projection_loss": lambda: loss(
         lambda x, depth: dp.projection_loss(x, CAMERAS, depth, logits=x[..., 0], mask_weight=0.1, upsample=2)

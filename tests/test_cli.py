@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
@@ -19,7 +19,8 @@ from train.config import fit_config_from_json
 from train.data.images import is_cut_out, read_images
 from train.data.procedural import generate
 from train.errors import UserError
-from train.evaluation.runs import open_run
+from train.evaluation.runs import best_weights, load_autoencoder, load_generator, open_run, read_metrics
+from train.methods import METHODS
 
 
 @pytest.fixture
@@ -41,10 +42,12 @@ def picture(tmp_path: Path) -> Path:
         ("fit --data {data} --out {tmp}/out --profile smoke --steps 0", "--steps must be at least 1"),
         ("fit --data {data} --out {tmp}/out --profile cpu", "not a multiple of the map size 28"),
         ("fit --data {data} --out {tmp}/out --profile smoke --categories zebra", "zebra"),
+        ("fit --data {data} --out {tmp}/out --profile smoke --stage1.views 9", "configuration asks for 9"),
         (
-            "fit --data {data} --out {tmp}/out --profile smoke --stage1.views 9",
-            "the configuration asks for 9",
+            "fit --data {data} --out {tmp}/out --system pix2mesh",
+            f"one of {', '.join(METHODS)}; got 'pix2mesh'",
         ),
+        ("fit --data {data} --out {tmp}/out --system=ptn --stage1.gamma 1", "ptn does not support a critic"),
         ("evaluate {tmp}/nowhere --data {data}", "nowhere"),
         ("evaluate {tmp}/empty --data {data}", "is not a run"),
         ("evaluate {run} --data {tmp}/nowhere --out {tmp}/out", "nowhere"),
@@ -98,20 +101,43 @@ def test_the_process_says_so_too(tmp_path: Path) -> None:
 def test_fit_and_evaluate_from_the_command_line(
     tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = tmp_path / "run"
-    fit = ["fit", "--data", str(tiny_data), "--out", str(run), "--profile", "smoke", "--steps", "2"]
-    assert main([*fit, "--stage1.codes", "3", "--seed", "7"]) == 0
+    where = ["fit", "--data", str(tiny_data), "--out", str(run := tmp_path / "run")]
+    assert main([*where, "--profile", "smoke", "--steps", "2", "--stage1.codes", "3", "--seed", "7"]) == 0
     config = fit_config_from_json((run / "config.json").read_text(), where="config.json")
     assert (config.seed, config.stage1.codes, config.stage1.steps, config.stage2.steps) == (7, 3, 2, 2)
     # A resumed run brings its own settings; only what contradicts them is refused.
-    assert main(["fit", "--data", str(tiny_data), "--out", str(run), "--resume"]) == 0
-    assert main(["fit", "--data", str(tiny_data), "--out", str(run), "--resume", "--seed", "8"]) == 2
+    assert main([*where, "--resume"]) == 0
+    assert main([*where, "--resume", "--seed", "8"]) == 2
     capsys.readouterr()
     for views in (["1", "2"], ["1,2"]):
         assert main(["evaluate", str(run), "--data", str(tiny_data), "--seeds", "0", "--views", *views]) == 0
         assert "medoid of train" in capsys.readouterr().out
         assert list(json.loads((run / "evaluation.json").read_text())["views"]) == ["1", "2"]
         (run / "evaluation.json").unlink()
+
+
+def test_variant_latent_head_and_a_trained_auto_encoder_by_their_old_names(
+    tiny_data: Path, smoke_run: Path, tmp_path: Path
+) -> None:
+    """Options of earlier versions: --ending, --health-every and --health-patience."""
+    run = tmp_path / "run"
+    command = ["fit", "--data", str(tiny_data), "--out", str(run), "--profile", "smoke", "--steps", "3"]
+    command += ["--variant", "highly-diverse", "--autoencoder", str(smoke_run)]
+    assert main([*command, "--ending", "latent", "--health-every", "2", "--health-patience=9"]) == 0
+    config = fit_config_from_json((run / "config.json").read_text(), where="config.json")
+    stage2 = config.stage2
+    assert (config.variant, stage2.joined_diversity, stage2.steps) == ("highly-diverse", True, 3)
+    assert (config.output_head, config.collapse_check_every, config.collapse_patience) == ("latent", 2, 9)
+    records = read_metrics(run)
+    assert [record["stage"] for record in records] == [1, 1, 1, 2, 2, 2]
+    assert ["image_sensitivity" in record for record in records] == [False, True, True] * 2
+    decoder, given = (
+        load_generator(run).shape_decoder,
+        load_autoencoder(best_weights(smoke_run, "autoencoder")),
+    )
+    assert decoder is not None
+    expected = given.decode.state_dict()
+    assert all(torch.equal(value, expected[name]) for name, value in decoder.state_dict().items())
 
 
 def test_reconstruct_writes_a_cloud_and_a_page(smoke_run: Path, picture: Path, tmp_path: Path) -> None:
@@ -181,35 +207,34 @@ def test_a_directory_of_that_name_goes_first(shipped: Path, picture: Path, tmp_p
         open_run(Path("pretrained"))
 
 
-@pytest.mark.parametrize(
-    "command",
-    ["", "data", "data procedural", "fit", "reconstruct", "evaluate", "experiment", "demo"],
-)
-def test_help_is_there_without_loading_torch(command: str) -> None:
-    code = "import sys; from train.__main__ import main\n"
-    code += "try: main(sys.argv[1:])\nexcept SystemExit as e: code = e.code\n"
-    code += "assert 'torch' not in sys.modules\nsys.exit(code)"
-    done = subprocess.run(
-        [sys.executable, "-c", code, *command.split(), "--help"], capture_output=True, text=True, check=False
-    )
+def test_help_of_everything_but_fit_does_not_load_torch() -> None:
+    commands = ["", "data", "data procedural", "reconstruct", "evaluate", "experiment", "demo"]
+    code = f"""
+import os, sys
+os.environ.pop("OMP_WAIT_POLICY", None)
+from train.__main__ import main
+for command in {commands}:
+    try:
+        main([*command.split(), "--help"])
+    except SystemExit as end:
+        assert end.code == 0
+assert "torch" not in sys.modules
+assert os.environ["OMP_WAIT_POLICY"] == "passive"  # before torch starts its threads
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "usage" in done.stdout
+    assert done.stdout.count("usage: python -m train") == len(commands)
 
 
-def test_fit_shows_the_profiles_own_defaults(capsys: pytest.CaptureFixture[str]) -> None:
-    for profile, steps in (("cpu", "4000"), ("full", "40000")):
+def test_fit_shows_its_methods_and_the_defaults_of_profile_and_method(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for options, steps in (["--profile", "full"], "40000"), (["--system=lin"], "8000"):
         with pytest.raises(SystemExit):
-            main(["fit", "--profile", profile, "--help"])
-        assert f"(default: {steps})" in capsys.readouterr().out
-
-
-def test_idle_threads_are_told_to_sleep_before_torch_starts() -> None:
-    code = "import train.__main__, os, sys; print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
-    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True
-    )
-    assert done.stdout.split() == ["passive", "False"]
+            main(["fit", *options, "--help"])
+        shown = capsys.readouterr().out
+        assert f"(default: {steps})" in shown
+        assert all(f"{name}: {method.summary[:20]}" in shown for name, method in METHODS.items())
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "I;16", "I", "F"])

@@ -17,6 +17,7 @@ import pytest
 import torch
 from PIL import Image
 from torch import Tensor
+from train.data.rules import Hider
 
 from diffpoint import PinholeCamera
 from models import build_generator
@@ -28,7 +29,6 @@ from train.data.embree import has_embree
 from train.data.families.chair import CHAIR
 from train.data.photos import convert_photos
 from train.data.procedural import generate
-from train.data.rules import Hider
 from train.data.solids import Solid, box, sample_union, surface_of
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate

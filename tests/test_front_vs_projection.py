@@ -12,6 +12,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from train.methods.systems import build_network
 
 from diffpoint import PinholeCamera, chamfer_distance, unproject
 from models import Generator, build_generator
@@ -28,7 +29,6 @@ from train.experiments.front_vs_projection.shapes import Cameras, embedded_shape
 from train.experiments.run import run_experiment
 from train.experiments.study import Study
 from train.methods.losses import Scene, supervise
-from train.methods.systems import build_network
 
 INFINITY = float("inf")
 ONE, TWO, SPHERE = Cameras(1), Cameras(2), Cameras(6, sphere=True)

@@ -118,10 +118,10 @@ def test_wrong_arguments_are_named() -> None:
         model(torch.rand(2, 3, 64, 64), torch.randn(1, 3, model.code_dim))
 
 
-@pytest.mark.parametrize("ending", ["points", "latent"])
-def test_bfloat16_predicts_nearly_the_same_points_in_full_resolution(ending):
+@pytest.mark.parametrize("output_head", ["points", "latent"])
+def test_bfloat16_predicts_nearly_the_same_points_in_full_resolution(output_head):
     torch.manual_seed(0)
-    model = build_generator("smoke", ending=ending)
+    model = build_generator("smoke", output_head=output_head)
     with torch.no_grad():
         for parameter in model.parameters():  # clouds as large as objects
             parameter.mul_(1.2)

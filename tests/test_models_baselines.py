@@ -88,7 +88,7 @@ def test_they_are_called_like_a_generator(build: Callable[[str], Baseline], prof
     assert clouds.shape[2] >= network.points
     assert clouds.isfinite().all()
     assert not clouds.requires_grad
-    assert torch.equal(clouds[0], network.answers(images[:, None])[:, 0])
+    assert torch.equal(clouds[0], network.predict_views(images[:, None])[:, 0])
     assert network.training
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
 
@@ -97,10 +97,12 @@ def test_they_are_called_like_a_generator(build: Callable[[str], Baseline], prof
 def test_several_views_of_an_object(build: Callable[[str], Baseline]) -> None:
     torch.manual_seed(0)
     network, images = build("smoke"), torch.rand(2, 3, 3, 32, 32)
-    answers = network.answers(images)
+    answers = network.predict_views(images)
     assert answers.shape[:2] == ((2, 1) if network.reads_views_together else (2, 3))
     if not network.reads_views_together:
-        torch.testing.assert_close(answers[:, 1], network.answers(images[:, 1:2])[:, 0], rtol=0, atol=1e-5)
+        torch.testing.assert_close(
+            answers[:, 1], network.predict_views(images[:, 1:2])[:, 0], rtol=0, atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("build", _BUILDERS)
@@ -109,7 +111,7 @@ def test_wrong_arguments_are_named(build: Callable[[str], Baseline]) -> None:
         build("huge")
     network = build("smoke")
     with pytest.raises(ValueError, match="'images'"):
-        network.answers(torch.rand(2, 3, 32, 32))
+        network.predict_views(torch.rand(2, 3, 32, 32))
     with pytest.raises(ValueError, match="'codes'"):
         network(torch.rand(2, 3, 32, 32), torch.zeros(1, 3, 0))
 

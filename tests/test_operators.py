@@ -33,7 +33,7 @@ def operator_arguments() -> dict[str, tuple]:
         "approxmatch": (a, b, *lengths, True),
         "farthest_point_sample": (a.detach(), lengths[0], 3, 0),
         "sample_view": (a, dp.splat_depth(a, camera).visible),
-        "visible": (a.detach(), lengths[0], projection.detach(), H, W, "cone", 3.0, 0.4),
+        "visible": (a.detach(), lengths[0], projection.detach(), H, W, "horizon", 3.0, 0.4),
     }
 
 

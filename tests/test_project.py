@@ -1,83 +1,49 @@
-"""The house itself: which way imports point, what the wheel holds, that the public names are documented."""
+"""The project: direction of imports, content of the wheel, documentation of the public names."""
 
-import ast
 import doctest
 import inspect
+import os
+import shutil
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
-import pytest
-
 import diffpoint
 
 ROOT = Path(__file__).parent.parent
-FLOORS = ("diffpoint", "models", "train")  # from the ground up
-ABOVE = ("examples", "tests", "benchmarks")
-OPS = (
-    "losses",
-    "splat",
-    "soft_splat",
-    "views",
-    "reproject",
-    "distances",
-    "transport",
-    "softmatch",
-    "sampling",
-)
 
 
-def imported(path: Path) -> set[str]:
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            if node.level:  # relative: within its own package
-                continue
-            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+def test_imports_point_down():
+    """The contracts are in pyproject.toml."""
+    done = subprocess.run(
+        [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
-def files(folder: str) -> list[Path]:
-    return sorted((ROOT / folder).rglob("*.py"))
-
-
-@pytest.mark.parametrize("floor", FLOORS)
-def test_imports_point_down(floor):
-    higher = FLOORS[FLOORS.index(floor) + 1 :] + ABOVE
-    for path in files(floor):
-        upward = {name for name in imported(path) if name.split(".")[0] in higher}
-        assert not upward, f"{path.relative_to(ROOT)} imports {sorted(upward)}"
-
-
-def test_kernels_import_taichi_only_and_the_reference_torch_only():
-    for path in files("diffpoint/kernels"):
-        allowed = {"taichi", "quadrants", "diffpoint.kernels", "types", "os"}
-        others = {
-            n
-            for n in imported(path)
-            if n.split(".")[0] not in allowed and not n.startswith("diffpoint.kernels")
-        }
-        assert not others, f"{path.relative_to(ROOT)} imports {sorted(others)}"
-    for path in files("diffpoint"):
-        if path.stem.startswith("reference"):
-            others = {
-                name
-                for name in imported(path)
-                if name.split(".")[0] not in ("torch", "itertools", "math", "__future__")
-            }
-            assert all(name.startswith("diffpoint.reference") for name in others), f"{path.name}: {others}"
-
-
-def test_inside_the_layer_imports_point_down():
-    for path in files("diffpoint"):
-        if path.stem in ("camera", "_checks", "_bridge", "_runtime") or path.parent.name == "kernels":
-            ops = {f"diffpoint.{op}" for op in OPS}
-            assert not imported(path) & ops, f"{path.name} imports an op"
-        if path.stem in OPS and path.stem != "losses":
-            assert "diffpoint.losses" not in imported(path)
+def test_an_upward_import_is_found(tmp_path):
+    """The contracts can fail: a copy of the tree whose lowest layer imports the highest one."""
+    for folder in ("diffpoint", "models", "train"):
+        shutil.copytree(
+            ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__", "pretrained")
+        )
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    with (tmp_path / "train" / "data" / "cache.py").open("a") as file:
+        file.write("\nfrom train.methods.base import Method\n")
+    done = subprocess.run(
+        [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    assert done.returncode == 1
+    assert "train.data.cache -> train.methods.base" in done.stdout
 
 
 def test_importing_the_layer_imports_neither_taichi_nor_the_learning_system():
@@ -107,6 +73,6 @@ def test_the_wheel_holds_the_layer_only(tmp_path):
     names = zipfile.ZipFile(wheel).namelist()
     top = {name.split("/")[0] for name in names}
     assert top == {"diffpoint", f"diffpoint-{diffpoint.__version__}.dist-info"}
-    sources = {str(path.relative_to(ROOT)) for path in files("diffpoint")}
+    sources = {str(path.relative_to(ROOT)) for path in (ROOT / "diffpoint").rglob("*.py")}
     assert sources <= set(names)
     assert "diffpoint/py.typed" in names

@@ -51,6 +51,31 @@ def test_every_public_name_has_its_place_in_the_reference():
     assert placed == set(diffpoint.__all__)
 
 
+def test_the_baseline_of_contributing_is_trained_and_evaluated(tiny_data, tmp_path, monkeypatch):
+    """The page's file and its line in the registry are all that a new method needs."""
+    import train.methods as methods
+    from train.evaluation.evaluate import evaluate
+    from train.evaluation.runs import load_predictor
+    from train.methods import weights
+    from train.training.trainer import fit
+
+    module, entry = python_blocks(ROOT / "CONTRIBUTING.md")
+    (tmp_path / "linear.py").write_text(module)
+    monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(tmp_path)])
+    name, value = eval("{" + entry + "}", {"Entry": methods.Entry}).popitem()
+    monkeypatch.setitem(methods.METHODS, name, value)
+    weights._kinds.cache_clear()
+    try:
+        run = tmp_path / "run"
+        assert fit(tiny_data, run, methods.recipe(name, "smoke"), progress=False)
+        assert type(load_predictor(run)).__name__ == "LinearNetwork"
+        result = evaluate(run, tiny_data, seeds=[0], views=[1], progress=False)
+        assert 0 < result["views"]["1"]["cd"] < 100
+    finally:
+        weights._kinds.cache_clear()
+        methods.get_method.cache_clear()
+
+
 @pytest.mark.slow
 def test_the_docs_build_without_a_warning(tmp_path):
     pytest.importorskip("sphinx", reason="the extra [docs] is not installed")

@@ -14,14 +14,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from train.config import PROFILES
 from train.data import ShapeTree
 from train.demo import DEMO_CONFIG, demo
 from train.errors import UserError
 from train.evaluation.report import make_example, write_report
 from train.evaluation.runs import load_generator, read_metrics
+from train.methods import recipe
 
-_SMOKE = PROFILES["smoke"]
+_SMOKE = recipe("ours", "smoke")
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The runtime in fresh processes: silent, lazy, polite to a host program's Taichi, clear after a fork."""
+"""How kernels are started and called: in fresh processes, in a host program's Taichi, after a fork, and directly."""
 
 import json
 import os
@@ -9,20 +9,25 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+import torch
 
-import diffpoint
+import diffpoint as dp
+from diffpoint import _bridge
+from diffpoint._launch import FastCall
+from diffpoint._runtime import RUNTIME
 
-BACKEND = diffpoint.runtime_info().backend  # taichi, or quadrants where DIFFPOINT_BACKEND says so
+BACKEND = dp.runtime_info().backend  # taichi, or quadrants if DIFFPOINT_BACKEND is set to it
 USE = "import torch, diffpoint as dp; d = lambda: dp.nearest(torch.zeros(1, 4, 3), torch.ones(1, 5, 3))\n"
 
 
-def run(code: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
-    script = USE + textwrap.dedent(code)
-    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=timeout)
+def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", USE + textwrap.dedent(code)]
+    environment = os.environ | environment
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
 
 
-def printed(code: str) -> str:
-    done = run(code)
+def printed(code: str, **environment: str) -> str:
+    done = run(code, **environment)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return done.stdout.strip()
@@ -56,6 +61,34 @@ def test_threads_are_configured_before_the_start_and_refused_after():
 
 def test_a_thread_count_below_one_is_refused():
     assert "'threads' must be a positive integer" in run("dp.configure(threads=0)").stderr
+
+
+@pytest.mark.parametrize("other", [name for name in ("taichi", "quadrants") if name != BACKEND])
+@pytest.mark.parametrize("installed", [True, False])
+def test_one_backend_is_chosen_and_started_once_whatever_else_is_imported(other, installed):
+    """A program may use the other compiler itself. Where that is not installed, an empty module has its name."""
+    if installed:
+        pytest.importorskip(other)
+    code = """
+        import sys, types
+        from diffpoint._runtime import RUNTIME
+        if INSTALLED:
+            import OTHER
+        else:
+            sys.modules["OTHER"] = types.ModuleType("OTHER")
+        d()
+        first = RUNTIME.current_program()
+        d()
+        print(dp.runtime_info().backend, dp.runtime_info().owner, RUNTIME.current_program() is first)
+    """.replace("INSTALLED", str(installed)).replace("OTHER", other)
+    assert printed(code, DIFFPOINT_BACKEND=BACKEND).endswith(f"{BACKEND} diffpoint True")
+
+
+def test_a_backend_that_does_not_exist_is_refused():
+    assert (
+        "DIFFPOINT_BACKEND must be 'taichi' or 'quadrants'; got 'cuda'"
+        in run("d()", DIFFPOINT_BACKEND="cuda").stderr
+    )
 
 
 HOST = """
@@ -208,5 +241,73 @@ def test_one_thread_and_two_give_the_same_bits():
     with ThreadPoolExecutor(2) as pool:  # most of the time each compiles, on one core
         digests = list(pool.map(digest, ("1", "2")))
     assert digests[0] == digests[1]
-    functions = {name for name in diffpoint.__all__ if name[0].islower()} - {"configure", "runtime_info"}
+    functions = {name for name in dp.__all__ if name[0].islower()} - {"configure", "runtime_info"}
     assert set(digests[0]) == functions
+
+
+CAMERA = dp.PinholeCamera.look_at((0, 0, -2), focal_px=8.0, height=6, width=7)
+
+
+def arguments(count: int) -> tuple:
+    points = torch.rand(2 * count * 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    projection = CAMERA.projection.expand(2, 3, 4).reshape(-1)
+    outputs = torch.zeros(2 * count * 2), torch.zeros(2 * count), torch.zeros(2)
+    return points, projection, *outputs, 1, count, 1
+
+
+def test_the_first_call_and_later_ones_agree_with_taichis():
+    dp.project(torch.zeros(1, 1, 3), CAMERA)  # starts the kernels
+    call = RUNTIME.call("reproject", "project", "f32")
+    for count in (5, 40, 0):
+        ours, theirs = arguments(count), arguments(count)
+        call(RUNTIME.current_program(), ours)
+        RUNTIME.kernel("reproject", "f32").project(*theirs)
+        for x, y in zip(ours, theirs, strict=True):
+            assert torch.equal(torch.as_tensor(x), torch.as_tensor(y))
+    if BACKEND == "taichi":
+        assert call.program is RUNTIME.current_program(), "Taichi's own call was used throughout"
+
+
+def test_arguments_of_another_type_are_left_to_taichi():
+    dp.project(torch.zeros(1, 1, 3), CAMERA)
+    call = RUNTIME.call("reproject", "project", "f32")
+    call(RUNTIME.current_program(), arguments(5))
+    points, *others = arguments(5)
+    for wrong in (points.double(), points.view(-1, 3), points[::2]):
+        with pytest.raises(Exception, match=r"(?i)dtype|dimension|contiguous"):
+            call(RUNTIME.current_program(), (wrong, *others))
+    call(RUNTIME.current_program(), arguments(5))
+
+
+@pytest.mark.parametrize("step", ["preparation", "arguments", "launch"])
+def test_where_taichis_inside_differs_its_own_call_is_used(step):
+    dp.project(torch.zeros(1, 1, 3), CAMERA)
+    program = RUNTIME.current_program()
+    call = FastCall(RUNTIME.kernel("reproject", "f32").project)
+    if step != "preparation":
+        call(program, arguments(5))
+    if step == "arguments":
+        call.compiled = object()  # has no make_launch_context
+    elif step == "launch":
+        call.code = None  # launch_kernel does not take this
+    else:
+        program = object()  # has no compile_kernel
+    for count in (5, 40):
+        ours, theirs = arguments(count), arguments(count)
+        call(program, ours)
+        RUNTIME.kernel("reproject", "f32").project(*theirs)
+        for x, y in zip(ours[2:5], theirs[2:5], strict=True):
+            assert x.any()
+            assert torch.equal(x, y)
+    assert not call.compatible
+
+
+def test_a_strided_output_is_refused_by_name():
+    points, projection, pixels, depth, total, *_ = arguments(5)
+    with pytest.raises(ValueError, match=r"'depth' of the kernel reproject\.project must be contiguous"):
+        strided = depth.repeat(2)[::2]
+        _bridge.launch(
+            "reproject", "project", torch.float32, points, projection, pixels, strided, total, 1, 5
+        )
+    _bridge.launch("reproject", "project", torch.float32, points, projection, pixels, depth, total, 1, 5)
+    assert depth.all()

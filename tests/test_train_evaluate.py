@@ -1,4 +1,4 @@
-"""Evaluation: closed forms of the figures, the trivial answers, and what evaluation.json holds."""
+"""Evaluation: closed forms of the metrics, the retrieval baselines, and what evaluation.json holds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from train.data.batches import load_split
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate
 from train.evaluation.metrics import cloud_errors, thin_out, transport_error
-from train.evaluation.per_shape import FIGURES
+from train.evaluation.per_shape import METRICS
 from train.evaluation.retrieval import medoid, nearest_by_image
 from train.methods.weights import save_weights
 from train.show.figures import errors_figure
@@ -83,13 +83,23 @@ def test_the_medoid_is_the_cloud_in_the_middle() -> None:
     assert medoid(clouds) == 2
 
 
-def test_the_nearest_image_of_a_known_shape_is_its_own(tiny_data: Path) -> None:
-    split = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, progress=False)
-    found = nearest_by_image(split, split, views=(1, 4))
-    assert all(index.tolist() == list(range(len(split))) for index in found.values())
-    shuffled = dataclasses.replace(split, images=list(split.images)[::-1])
-    found = nearest_by_image(shuffled, split, views=(2,))
-    assert found[2].tolist() == list(reversed(range(len(split))))
+@pytest.mark.parametrize("chunk_bytes", [2**28, 1], ids=["all at once", "one by one"])
+def test_the_nearest_training_shape_by_image(
+    chunk_bytes: int, tiny_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("train.evaluation.retrieval._CHUNK_BYTES", chunk_bytes)
+    train, test = (
+        load_split(tiny_data, name, image_size=(48, 64), map_size=16, progress=False)
+        for name in ("train", "test")
+    )
+    found = nearest_by_image(train, train, views=(1, 4))
+    assert all(index.tolist() == list(range(len(train))) for index in found.values())
+    # Against all distances at once. The split twice: of equally near shapes the first counts.
+    twice = dataclasses.replace(train, images=[*train.images] * 2, ids=train.ids * 2)
+    known, seen = (torch.stack(list(split.images)).flatten(2).double() / 255 for split in (twice, test))
+    distance = torch.cdist(seen.flatten(0, 1), known.flatten(0, 1)).view(len(test), 4, len(twice), 4).amin(3)
+    for n, index in nearest_by_image(test, twice, views=(1, 2, 4)).items():
+        assert index.tolist() == distance[:, :n].sum(1)[:, : len(train)].argmin(1).tolist()
 
 
 def test_evaluation_holds_what_the_design_promises(smoke_run: Path, tiny_data: Path, tmp_path: Path) -> None:
@@ -109,7 +119,7 @@ def test_evaluation_holds_what_the_design_promises(smoke_run: Path, tiny_data: P
     assert result["seeds"] == [0, 1]
     assert list(result["views"]) == ["1", "2", "4"]  # the data have four views
     for n, row in result["views"].items():
-        assert list(row) == list(FIGURES)
+        assert list(row) == list(METRICS)
         assert {"gt_to_pred", "pred_to_gt", "cd", "fps_cd", "consistency"} <= row.keys()
         assert row["cd"] == pytest.approx(row["gt_to_pred"] + row["pred_to_gt"], rel=1e-5)
         assert row["fps_cd"] == pytest.approx(row["fps_gt_to_pred"] + row["fps_pred_to_gt"], rel=1e-5)

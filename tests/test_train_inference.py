@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
+import train
 from diffpoint import consistency_loss
-from models import Generator, build_generator
+from models import PROFILES, Generator, build_generator
 from train.config import InferenceConfig
 from train.evaluation.inference import reconstruct
+from train.methods.weights import save_weights
 
 
 @pytest.fixture(scope="module")
@@ -190,3 +198,59 @@ def test_wrong_arguments_are_named(model: Generator) -> None:
         reconstruct(model, torch.ones(2, 3, 48, 64), groups=0)
     with pytest.raises(ValueError, match=r"patience >= 0; got 5, 30 and -1"):
         reconstruct(model, torch.ones(2, 3, 48, 64), settings=InferenceConfig(patience=-1))
+
+
+# --- weights
+
+
+def _header(path: Path) -> dict:
+    with safe_open(path, framework="pt") as file:
+        return json.loads(file.metadata()["diffpoint.generator"])
+
+
+def test_headers_of_earlier_versions_are_read_and_new_names_written(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = build_generator(config=dataclasses.replace(PROFILES["smoke"], occupancy_logits=True))
+    save_weights(model, tmp_path / "new.safetensors")
+    header = _header(tmp_path / "new.safetensors")
+    assert header == dataclasses.asdict(model.config)
+
+    header["ending"], header["existence"] = header.pop("output_head"), header.pop("occupancy_logits")
+    tensors = {name: value.contiguous() for name, value in model.state_dict().items()}
+    save_file(tensors, tmp_path / "old.safetensors", {"diffpoint.generator": json.dumps(header)})
+    old = train.load_generator(tmp_path / "old.safetensors")
+    assert old.config == model.config
+    assert all(torch.equal(value, model.state_dict()[name]) for name, value in old.state_dict().items())
+
+
+def test_the_shipped_weights_have_an_old_header_and_load() -> None:
+    assert "ending" in _header(Path(train.__file__).parent / "pretrained" / "generator.safetensors")
+    model = train.load_generator("pretrained")
+    assert model.config.output_head == "points"
+    assert not model.training
+
+
+# --- from Python
+
+
+def test_a_bare_import_offers_the_python_interface_and_loads_nothing() -> None:
+    code = """
+import sys, train
+assert "torch" not in sys.modules and {"load_generator", "reconstruct", "data"} <= set(dir(train))
+import torch
+model = train.load_generator("pretrained")
+found = train.reconstruct(model, torch.rand(2, 3, 32, 32), groups=2, steps=1, seed=0)
+assert isinstance(found, train.Reconstruction) and found.points.shape == (1, 2 * model.points, 3)
+assert train.data.ShapeTree.__name__ == "ShapeTree" and not model.training
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    with pytest.raises(AttributeError, match="no attribute 'load_critic'"):
+        _ = train.load_critic  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_a_run_can_be_named_by_its_directory_or_file_as_str_or_path(smoke_run: Path) -> None:
+    best = smoke_run / "checkpoints" / "best-stage2.safetensors"
+    weights = [train.load_generator(named).state_dict() for named in (smoke_run, str(smoke_run), str(best))]
+    for other in weights[1:]:
+        assert all(torch.equal(value, weights[0][name]) for name, value in other.items())

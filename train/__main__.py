@@ -20,11 +20,11 @@ import tyro
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 from tyro.constructors import PrimitiveConstructorSpec
 
-from train.config import PROFILES, FitConfig, System, fit_config_from_json, with_steps, with_variant
+from train.config import FitConfig, Profile, fit_config_from_json, renamed_options, with_steps
 from train.data_commands import Data
 from train.errors import UserError
-from train.experiments.registry import ABOUT_ALL, QUESTIONS
-from train.methods.recipes import with_system
+from train.experiments.registry import ABOUT_ALL, EXPERIMENTS
+from train.methods import METHODS, recipe
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
 
@@ -48,12 +48,6 @@ Numbers = Annotated[
 
 @dataclasses.dataclass
 class Fit:
-    """Train an auto-encoder of shapes, then a generator: stage 1 on single views, stage 2 on joined views.
-
-    Ctrl-C saves and leaves. The defaults below are those of the profile and the variant; put --profile and --variant
-    before --help to see another's.
-    """
-
     data: tuple[Path, ...]
     """Root of a data tree (see the `data` command); several are put together."""
     out: Path
@@ -65,7 +59,7 @@ class Fit:
     """The same number of steps for every phase, ramps in proportion, for a quick trial."""
 
     def run(self) -> int:
-        from train.distributed import gather
+        from train.distributed import connect
         from train.training.trainer import fit
 
         config = self.config
@@ -76,11 +70,21 @@ class Fit:
         if not fit(self.data, self.out, config, resume=self.resume):
             print(f"stopped early and saved; continue with --resume --out {self.out}", file=sys.stderr)
             return 130
-        if gather().writes:
+        if connect().is_main:
             print(
                 f"trained; see {self.out}, or run: python -m train evaluate {self.out} --data {self.data[0]}"
             )
         return 0
+
+
+_METHODS = "\n\n".join(f"    {name}: {method.summary}." for name, method in METHODS.items())
+Fit.__doc__ = f"""Train an auto-encoder of shapes, then a generator: stage 1 on single views, stage 2 on joined views.
+
+    Ctrl-C saves and stops. The defaults below are those of the profile, method and variant; put --profile, --system and
+    --variant before --help to see others. Methods (--system):
+
+{_METHODS}
+    """
 
 
 @dataclasses.dataclass
@@ -150,12 +154,14 @@ class Evaluate:
         )
 
 
-def _questions() -> str:
-    everything = {**QUESTIONS, **ABOUT_ALL}.items()
-    lines = "\n\n".join(f"{name}: {words}{'' if words[-1] in '?)' else '.'}" for name, words in everything)
-    return f"""Answer one question by measurement; writes NAME.json, NAME.md and NAME.png into --out.
+def _about_experiments() -> str:
+    everything = {name: entry.description for name, entry in EXPERIMENTS.items()} | ABOUT_ALL
+    lines = "\n\n".join(
+        f"{name}: {words}{'' if words[-1] in '?)' else '.'}" for name, words in everything.items()
+    )
+    return f"""Run one experiment; writes NAME.json, NAME.md and NAME.png into --out.
 
-    Trains what it needs, once for all experiments that write to the same place, and goes on where it was stopped.
+    Trains what it needs, once for all experiments that write to the same place; a stopped experiment continues.
 
     {lines.replace(chr(10), chr(10) + "    ")}
 
@@ -171,7 +177,7 @@ class Experiment:
         PrimitiveConstructorSpec(
             nargs=1,
             metavar="NAME",
-            choices=tuple(QUESTIONS | ABOUT_ALL),
+            choices=(*EXPERIMENTS, *ABOUT_ALL),
             instance_from_str=lambda words: words[0],
             is_instance=lambda value: isinstance(value, str),
             str_from_instance=lambda value: [value],
@@ -181,7 +187,7 @@ class Experiment:
     out: Path
     """Directory to write to."""
     data: tuple[Path, ...] = ()
-    """Root of a data tree; several are put together for training, and the first one's test split is scored (health:
+    """Root of a data tree; several are put together for training, and the first one's test split is measured (collapse:
     each on its own)."""
     profile: Literal["full", "cpu", "smoke"] = "cpu"
     """Size of the networks, and how they are trained."""
@@ -203,24 +209,24 @@ class Experiment:
     """agreement: views per shape."""
 
     def run(self) -> None:
-        from train.experiments.run import Workbench, run_all, run_experiment, show_all, write_page
+        from train.experiments.run import Study, print_status, run_all, run_experiment, write_page
 
         processes = os.cpu_count() or 1 if self.processes is None else self.processes
-        bench = Workbench(
-            self.data, self.out, self.profile, self.seeds, self.limit, self.steps,
-            processes=processes, category=self.category, pictures=self.pictures,
+        study = Study(
+            self.data, self.out, self.profile, self.seeds, self.limit, self.steps, processes=processes,
+            category=self.category, pictures=self.pictures, run=self.run_, views=self.views,
         )  # fmt: skip
         if self.name == "list":
-            show_all(bench)
+            print_status(study)
         elif self.name == "all":
-            run_all(bench)
+            run_all(study)
         elif self.name == "page":
             print(f"wrote {write_page(self.out)}")
         else:
-            run_experiment(self.name, bench, run=self.run_, views=self.views)
+            run_experiment(self.name, study)
 
 
-Experiment.__doc__ = _questions()
+Experiment.__doc__ = _about_experiments()
 
 
 @dataclasses.dataclass
@@ -238,7 +244,7 @@ class Demo:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; a user's mistake becomes one line on stderr and exit code 2."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    arguments = renamed_options(sys.argv[1:] if arguments is None else arguments)
     try:
         command = _parse(arguments)
         return command.run() or 0
@@ -254,7 +260,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(arguments: list[str]) -> Any:
-    fit = Fit(data=tyro.MISSING, out=tyro.MISSING, config=_fit_defaults(arguments))
+    # The methods' recipes import torch: only `fit` waits for that.
+    config = _fit_defaults(arguments) if arguments[:1] == ["fit"] else tyro.MISSING
+    fit = Fit(data=tyro.MISSING, out=tyro.MISSING, config=config)
     kinds = (
         Annotated[Data, subcommand("data")]
         | Annotated[Fit, subcommand("fit", default=fit)]
@@ -276,13 +284,15 @@ def _fit_defaults(arguments: list[str]) -> FitConfig:
     given = dict(itertools.pairwise(arguments))
     given |= dict(a.split("=", 1) for a in arguments if a.startswith("--") and "=" in a)
     saved = Path(given.get("--out", "")) / "config.json"
-    if arguments[:1] == ["fit"] and "--resume" in arguments and saved.is_file():
+    if "--resume" in arguments and saved.is_file():
         return fit_config_from_json(saved.read_text(), where=str(saved))
-    profile = PROFILES.get(given.get("--profile", "cpu"), PROFILES["cpu"])
-    for system in get_args(System):
-        if given.get("--system") == system:
-            profile = with_system(profile, system)
-    return with_variant(profile, "highly-diverse") if given.get("--variant") == "highly-diverse" else profile
+    profile = given.get("--profile", "cpu")
+    config = recipe(given.get("--system", "ours"), profile if profile in get_args(Profile) else "cpu")
+    if given.get("--variant") == "highly-diverse" and config.system == "ours":
+        from train.methods.ours import highly_diverse
+
+        return highly_diverse(config)
+    return config
 
 
 if __name__ == "__main__":

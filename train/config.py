@@ -1,4 +1,4 @@
-"""Every number of a run, in frozen dataclasses: profiles full (the paper), cpu (a laptop), smoke (tests).
+"""The configuration of a training run, in frozen dataclasses. The values of each profile: train/methods.
 
 The resolved configuration is written beside every result. Units: distances in world units (an object is about
 one unit across); `front="emd"` is the paper's sum over matched points, `front="chamfer"` the mean chamfer
@@ -22,12 +22,11 @@ if TYPE_CHECKING:
 
 Profile = Literal["full", "cpu", "smoke"]
 Variant = Literal["standard", "highly-diverse"]
-Ending = Literal["points", "latent"]
+OutputHead = Literal["points", "latent"]
 Precision = Literal["float32", "bfloat16"]
 Supervision = Literal["front", "projection", "lin", "soft"]
 # The methods of `diffpoint.visible_points`, whose import would load torch; a test compares them.
-Visibility = Literal["zbuffer", "radius", "pyramid", "cone", "horizon", "hpr"]
-System = Literal["ours", "psgn", "psgn-mon", "front-mon", "lin", "r2n2", "ptn"]
+Visibility = Literal["zbuffer", "horizon", "hpr"]
 
 # The paper's alpha multiplies the released code's approximate EMD: a sum over 2048 points, about 1.3 times
 # the exact optimum. Ours is exact and a mean, so that it means the same at any number of points.
@@ -55,9 +54,9 @@ class Schedule:
         return warm * (final + (first - final) * share_left)
 
     def lasting(self, steps: int) -> Self:
-        """The same phase in so many steps; what happens at a certain step happens earlier or later with it.
+        """The same phase with another number of steps, its schedules stretched in proportion.
 
-        A phase of no steps stays one.
+        A phase of 0 steps keeps 0.
         """
         if self.steps == 0:
             return self
@@ -83,11 +82,11 @@ class StageConfig(Schedule):
     codes: int
     """Random codes per image (the paper's R)."""
     joined_views: bool
-    """False: each image's cloud meets its own depth map. True: the clouds of a shape's views are concatenated
-    first and the whole meets the depth map of each view."""
+    """False: each image's cloud is compared with the depth map of that image. True: the clouds of a shape's views are
+    concatenated first, and the whole is compared with the depth map of each view."""
     front: Literal["emd", "chamfer"]
-    """Distance of the front constraint: earth mover's (sum over matched points) or chamfer (mean x100). A system that
-    is taught with whole clouds compares them by it (mean x100)."""
+    """Distance of the front constraint: earth mover's (sum over matched points) or chamfer (mean x100). A method that
+    is trained on whole clouds uses it to compare them (mean x100)."""
     alpha: float
     """The paper's alpha: how much a change of code must change the shape (in the unit of the released
     code)."""
@@ -98,21 +97,21 @@ class StageConfig(Schedule):
     diversity_stride: int
     """Every how many-th point of a cloud takes part in the diversity loss, in turns."""
     ramp: tuple[int, int]
-    """Steps between which the diversity weight rises from 0 to beta: the image has to speak before the codes."""
+    """Steps between which the diversity weight rises from 0 to beta: the network first learns to use the image."""
     select: Literal["cd", "fps_cd", "cd_1", "last"]
     """Validation figure by which the stage's best checkpoint is chosen: of all views joined, of these thinned to the
     size of one prediction, or of one view. "last": none; the weights at the end are kept."""
     supervision: Supervision = "front"
-    """How predictions meet the depth maps of their images. "front" is the paper's front constraint. The others take its
-    place, in its unit: "projection", the depth of rendered pixels; "lin", that and a mask term on the points'
-    existence, as Lin et al. have it; "soft", depth and mask of a soft rendering."""
+    """How predictions are compared with the depth maps of their images. "front" is the paper's front constraint. The
+    others replace it, in its unit: "projection", the depth of rendered pixels; "lin", that and a mask term on occupancy
+    logits of the points, as in Lin et al.; "soft", depth and mask of a soft rendering."""
     visibility: Visibility = "zbuffer"
-    """How the front constraint finds the predicted points that a camera sees; see `diffpoint.visible_points`."""
+    """How the front constraint selects the predicted points that a camera sees; see `diffpoint.visible_points`."""
     joined_diversity: bool = False
     """False: the diversity loss compares single-view clouds. True: the concatenated clouds of all views, as in
     the paper's "highly diverse" model."""
     gamma: float = 0.0
-    """Weight of the critic's opinion in the generator's loss (the paper's gamma); 0 trains without a critic."""
+    """Weight of the critic term in the generator's loss (the paper's gamma); 0 trains without a critic."""
     n_critic: int = 1
     """Critic steps before each generator step."""
     critic_learning_rate: float = 1e-4
@@ -122,7 +121,7 @@ class StageConfig(Schedule):
     real_pool: int = 0
     """Ground truth clouds of other shapes that the critic sees, for each shape of the batch, beside its own."""
     weight_decay: float = 0.0
-    """Weight of |weights|^2 / 2 beside the loss; no part of the paper's own training."""
+    """Weight of |weights|^2 / 2 added to the loss; not used by the paper's own training."""
 
     @property
     def exact_alpha(self) -> float:
@@ -159,12 +158,12 @@ class InferenceConfig:
     keep_best: bool = False
     """Return each shape's codes with the lowest loss on the way instead of the last ones."""
     prior: float = 0.0
-    """Weight of |code|^2 / 2 beside the loss: pulls codes back to the N(0, 1) they were drawn from."""
+    """Weight of |code|^2 / 2 added to the loss: pulls codes back to the N(0, 1) they were drawn from."""
     keep_norm: bool = False
     """Rescale every code to its first length after each step, so that it stays as likely under N(0, 1)."""
     scored: Literal["joined", "each"] = "joined"
-    """How predictions from several views are compared with the truth: as one cloud, or each by itself, of which the
-    mean is taken."""
+    """How predictions from several views are compared with the ground truth: concatenated to one cloud, or each by
+    itself, with the mean of the distances."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,25 +177,24 @@ class FitConfig:
     pretrain: PretrainConfig = PretrainConfig(
         steps=1_500, shapes=32, learning_rate=5e-4, final_learning_rate=5e-5
     )
-    """The auto-encoder, whose codes the critic judges."""
+    """The auto-encoder, in whose latent space the critic works."""
     profile: Profile = "cpu"
     """Size of the network: full 192 x 256 images and 2048 points, cpu 96 x 128 and 512, smoke 48 x 64 and
     128."""
     variant: Variant = "standard"
-    """The paper's main model, or its "highly diverse" one, whose predictions disagree the more without search."""
-    system: System = "ours"
-    """What is trained: the conditional generator as the paper has it, or one of the methods that it is compared with.
-    Their recipes: train/recipes.py; their losses: train/lessons.py."""
-    ending: Ending = "points"
-    """What the generator ends in: points (the released network), or a code of the auto-encoder, whose frozen
+    """The paper's main model, or its "highly diverse" one, whose predictions disagree more before search."""
+    system: str = "ours"
+    """The method: the paper's conditional generator, or one that it is compared with. See the list above."""
+    output_head: OutputHead = "points"
+    """What the generator predicts: points (the released network), or a latent of the auto-encoder, whose frozen
     decoder makes the points (the network of the paper's text)."""
     precision: Precision = "float32"
-    """In what the generator computes while it learns. bfloat16: all layers but the last, about twice as fast where the
+    """Number format of the generator during training. bfloat16: all layers but the last, about twice as fast where the
     processor can multiply such numbers (avx512_bf16, amx; see lscpu), slower elsewhere."""
     autoencoder: str | None = None
     """A run, or a .safetensors file of one, whose auto-encoder is used instead of training one."""
     start: str | None = None
-    """A run, or a .safetensors file of one, with whose weights the generator starts instead of fresh ones."""
+    """A run, or a .safetensors file of one, whose weights the network starts from."""
     categories: tuple[str, ...] = ()
     """Categories to train on; none means all."""
     deterministic: bool = False
@@ -215,23 +213,23 @@ class FitConfig:
     """Shapes of the validation split that a validation uses, at most."""
     checkpoint_every: int = 250
     """Steps between checkpoints; a killed run loses at most these."""
-    health_every: int = 50
-    """Steps between measurements of what image and code do to the prediction."""
+    collapse_check_every: int = 50
+    """Steps between collapse checks: how much predictions change with the image and with the code."""
     min_image_sensitivity: float = 0.15
-    """A run whose predictions of different images differ by less (chamfer x100) after `health_patience` steps
-    is stopped: its image trunk has died, whatever the loss says."""
-    health_patience: int = 600
-    """Steps of stage 1 that the image is given to start to matter."""
+    """A run whose predictions of different images differ by less (chamfer x100) after `collapse_patience` steps
+    is stopped: its image encoder has collapsed, even if the loss still falls."""
+    collapse_patience: int = 600
+    """Steps of stage 1 before the collapse check can stop a run."""
     keep_checkpoints: int = 2
     """How many of the newest checkpoints are kept for --resume, beside the best weights of every phase."""
     log_every: int = 10
     """Steps between lines in metrics.jsonl."""
     picture_every: int = 1_000
-    """Steps between pictures of predictions in figures/; 0: none."""
+    """Steps between pictures of predictions in figures/; 0 draws none."""
 
     @property
     def stages(self) -> tuple[StageConfig, StageConfig]:
-        """Both stages, as they are run: the deterministic counterpart has nothing to diversify."""
+        """Both stages, as they are run: the deterministic counterpart has one code and no diversity loss."""
         if not self.deterministic:
             return self.stage1, self.stage2
         plain = [dataclasses.replace(s, codes=1, beta=0.0) for s in (self.stage1, self.stage2)]
@@ -239,18 +237,18 @@ class FitConfig:
 
     @property
     def needs_autoencoder(self) -> bool:
-        """Does a critic judge codes, or a decoder make the points?"""
-        return self.ending == "latent" or any(stage.gamma > 0 for stage in self.stages)
+        """Does the training use an auto-encoder: for a critic, or for the latent output head?"""
+        return self.output_head == "latent" or any(stage.gamma > 0 for stage in self.stages)
 
     @property
-    def existence(self) -> bool:
-        """Does a loss ask which points exist?"""
+    def occupancy_logits(self) -> bool:
+        """Does a loss need occupancy logits of the points?"""
         return any(stage.supervision == "lin" for stage in self.stages)
 
     @property
     def phases(self) -> dict[str, PretrainConfig | StageConfig]:
-        """What is run, in order, by name. A phase of no steps is left out, and so is the auto-encoder's if none is
-        needed or one is given."""
+        """The phases that are run, in order, by name. A phase of 0 steps is left out, and so is the auto-encoder's if
+        none is needed or a trained one is given."""
         stage1, stage2 = self.stages
         found = {"autoencoder": self.pretrain, "stage1": stage1, "stage2": stage2}
         if not self.needs_autoencoder or self.autoencoder:
@@ -258,66 +256,8 @@ class FitConfig:
         return {name: phase for name, phase in found.items() if phase.steps}
 
 
-_FULL_STAGE1 = StageConfig(
-    steps=40_000, shapes=2, views=8, codes=5, joined_views=False, front="emd", alpha=0.2, beta=10.0,
-    diversity_images=16, diversity_stride=1, ramp=(1_000, 4_000), select="cd",
-    warmup=500, gamma=0.1,
-)  # fmt: skip
-_FULL_STAGE2 = StageConfig(
-    steps=100_000, shapes=2, views=8, codes=5, joined_views=True, front="chamfer", alpha=0.1, beta=1.0,
-    diversity_images=16, diversity_stride=1, ramp=(0, 1), select="fps_cd",
-    warmup=500, gamma=0.1,
-)  # fmt: skip
-# 500 epochs of the 5400 training chairs.
-_FULL_PRETRAIN = PretrainConfig(steps=54_000, shapes=50, learning_rate=5e-4, final_learning_rate=5e-4)
-# Without a critic, and so without an auto-encoder: on the embedded chairs and displays (400 + 200 steps, mean of two
-# seeds) gamma 0 / 0.1 end at CD 6.5 / 6.7 and FPS-CD 7.4 / 7.6, gamma 1 (one seed) at 6.6 and 7.7, and a step with the
-# critic takes 0.19 s of a core instead of 0.13 s. Longer trainings may judge otherwise: --stage1.gamma, --stage2.gamma.
-_CPU_STAGE1 = StageConfig(
-    steps=4_000, shapes=16, views=1, codes=3, joined_views=False, front="emd", alpha=0.2, beta=10.0,
-    diversity_images=8, diversity_stride=2, ramp=(400, 1_200), select="cd",
-    learning_rate=5e-4, final_learning_rate=5e-5, warmup=200,
-)  # fmt: skip
-# The paper's alpha, 0.1, asks 512 points for more change than these shapes have to hide: the front begins to vary too.
-# On the embedded shapes (one seed, 800 steps from the same stage 1) 0.2 lowers CD at 8 views from 4.6 to 4.3 and
-# FPS-CD from 5.5 to 5.2.
-_CPU_STAGE2 = StageConfig(
-    steps=2_000, shapes=4, views=4, codes=3, joined_views=True, front="chamfer", alpha=0.2, beta=1.0,
-    diversity_images=8, diversity_stride=2, ramp=(0, 400), select="fps_cd",
-    learning_rate=4e-4, final_learning_rate=1e-5, warmup=200,
-)  # fmt: skip
-_SMOKE_STAGE1 = dataclasses.replace(
-    _CPU_STAGE1, steps=30, shapes=3, views=1, codes=2, diversity_images=2, ramp=(5, 20), warmup=5, gamma=0.1
-)
-_SMOKE_STAGE2 = dataclasses.replace(
-    _CPU_STAGE2, steps=20, shapes=2, views=2, codes=2, diversity_images=2, warmup=5, gamma=0.1
-)
-_CPU_PRETRAIN = PretrainConfig(steps=1_500, shapes=32, learning_rate=5e-4, final_learning_rate=5e-5)
-_SMOKE_PRETRAIN = dataclasses.replace(_CPU_PRETRAIN, steps=20, shapes=6)
-
-PROFILES: dict[str, FitConfig] = {
-    "full": FitConfig(
-        _FULL_STAGE1, _FULL_STAGE2, _FULL_PRETRAIN, "full", map_size=56, validate_every=2_000, validation_shapes=200,
-        checkpoint_every=1_000, health_every=500, health_patience=8_000, picture_every=5_000,
-    ),
-    # The paper's 30 steps of 0.5 make the views of a network this small agree at the expense of coverage: CD + 0.29,
-    # FPS-CD - 0.05 against random codes at 8 views. 10 of 0.1: + 0.02 and - 0.11, on other shapes + 0.08
-    # and - 0.05 (docs/results.md). With two images a pair's gradient is four times as long as with eight, and one shape
-    # in 264 got worse in the end: the best codes on the way are kept.
-    "cpu": FitConfig(
-        _CPU_STAGE1, _CPU_STAGE2, _CPU_PRETRAIN, "cpu",
-        inference=InferenceConfig(steps=10, step_size=0.1, keep_best=True),
-    ),
-    "smoke": FitConfig(
-        _SMOKE_STAGE1, _SMOKE_STAGE2, _SMOKE_PRETRAIN, "smoke", map_size=16,
-        inference=InferenceConfig(groups=2, steps=3), validate_every=10, validation_shapes=4,
-        checkpoint_every=10, health_every=10, health_patience=10_000, log_every=1, picture_every=25,
-    ),
-}  # fmt: skip
-
-
 def with_steps(config: FitConfig, steps: int) -> FitConfig:
-    """The same recipe with so many steps in every phase, ramps and warm-ups in proportion."""
+    """The same recipe with another number of steps in every phase, ramps and warm-ups in proportion."""
     return dataclasses.replace(
         config,
         pretrain=config.pretrain.lasting(steps),
@@ -337,36 +277,32 @@ def scaled(config: FitConfig, share: float) -> FitConfig:
         pretrain=config.pretrain.lasting(times(config.pretrain.steps)),
         stage1=config.stage1.lasting(times(config.stage1.steps)),
         stage2=config.stage2.lasting(times(config.stage2.steps)),
-        health_patience=times(config.health_patience),
+        collapse_patience=times(config.collapse_patience),
     )
 
 
-def with_variant(config: FitConfig, variant: Variant) -> FitConfig:
-    """A profile's recipe, for another of the paper's models.
-
-    "highly-diverse" is the model of the paper's table on consistency: in stage 2 diversity is asked of the joined
-    clouds of all views, and stage 2 is two fifths as long. Its last weights are kept: random codes, with which
-    validation is made, are not what it is meant for, and it would choose the least diverse.
-
-    The paper has weight 0.5 and alpha 15, which can only be meant for the mean distance: for the sum it would be
-    satisfied by any two clouds. That asks for a whole object of change, without end. In the profile "cpu" (seed 0)
-    either the front constraint wins (weights 0.5 and 2: codes move a prediction by 2.7, in the main model by 3.6; CD
-    x100) or points fly out of all images (6 and 20: CD above 50). All profiles but "full" therefore ask for a fifth of
-    an object, with weight 1.
-    """
-    if variant == "standard":
-        return config
-    stage2 = config.stage2.lasting(max(1, round(0.4 * config.stage2.steps)))
-    alpha, beta = (15.0, 0.5) if config.profile == "full" else (80.0, 1.0)
-    stage2 = dataclasses.replace(
-        stage2, joined_diversity=True, alpha=alpha / EXACT_MEAN_EMD_FROM_PAPER, beta=beta, select="last"
-    )
-    return dataclasses.replace(config, variant=variant, stage2=stage2)
+# Names of fields in the files of earlier versions, and of their options on the command line.
+_OLD_NAMES = {
+    "ending": "output_head",
+    "health_every": "collapse_check_every",
+    "health_patience": "collapse_patience",
+}
 
 
-def to_json(config: FitConfig, *, data: Path | Sequence[Path]) -> str:
+def renamed_options(arguments: Sequence[str]) -> list[str]:
+    """Command line arguments with the options of earlier versions replaced by today's."""
+    options = {f"--{old.replace('_', '-')}": f"--{new.replace('_', '-')}" for old, new in _OLD_NAMES.items()}
+
+    def rename(argument: str) -> str:
+        name, equals, value = argument.partition("=")
+        return options.get(name, name) + equals + value
+
+    return [rename(argument) for argument in arguments]
+
+
+def to_json(config: FitConfig, *, data: str | Path | Sequence[str | Path]) -> str:
     """A run's config.json: the data it was trained on, and every field of its configuration."""
-    trees = str(data) if isinstance(data, Path) else [str(root) for root in data]
+    trees = str(data) if isinstance(data, (str, Path)) else [str(root) for root in data]
     return json.dumps({"data": trees, **dataclasses.asdict(config)}, indent=2) + "\n"
 
 
@@ -380,6 +316,9 @@ def fit_config_from_json(text: str, *, where: str) -> FitConfig:
     try:
         values = json.loads(text)
         values.pop("data", None)
+        for old, new in _OLD_NAMES.items():
+            if old in values:
+                values[new] = values.pop(old)
         return _build(FitConfig, values)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise UserError(

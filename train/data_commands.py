@@ -1,4 +1,4 @@
-"""The commands under `python -m train data`. Each imports what it runs when it runs, so that --help answers at once."""
+"""The commands under `python -m train data`. Each imports its code when it runs, so that --help is fast."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from tyro.conf import OmitArgPrefixes, Positional, subcommand
 
 @dataclasses.dataclass
 class Procedural:
-    """Generate shapes with designed ambiguity: what one view hides, it truly leaves open."""
+    """Generate a data tree of procedural shapes; needs no download.
+
+    In seven of thirteen categories the front view hides one of three different backs, see docs/families.md.
+    """
 
     out: Path
-    """Directory of the new data tree."""
+    """Directory of the new data tree; running the command again finishes or extends it."""
     shapes: int = 400
-    """How many shapes, over all categories."""
+    """Number of shapes, over all categories."""
     categories: tuple[str, ...] = ()
-    """Families to draw from, for instance `chair display`; none means all thirteen."""
+    """Categories to generate, for instance `chair display`; all thirteen if not given."""
     seed: int = 0
     """The same seed gives the same tree."""
     size: int = 224
@@ -42,36 +45,40 @@ class Procedural:
 
 @dataclasses.dataclass
 class Meshes:
-    """Render meshes into a data tree: OBJ, GLB, PLY or OFF in folders, zips, .sh3f libraries or ShapeNet trees."""
+    """Render meshes into a data tree: OBJ, GLB, glTF, PLY, OFF or STL, from folders or archives.
+
+    Folders may be laid out as ShapeNetCore; archives are .zip files and .sh3f libraries of Sweet Home 3D.
+    """
 
     sources: Positional[tuple[Path, ...]]
-    """Mesh files, folders, zips or .sh3f libraries."""
+    """Mesh files, folders, .zip archives or .sh3f libraries."""
     out: Path
-    """Directory of the new data tree."""
+    """Directory of the new data tree; running the command again finishes or extends it."""
     labels: Path | None = None
-    """CSV that names the category of each mesh; only labelled meshes are taken then."""
+    """CSV file with the category of each mesh; meshes without a label are left out."""
     category: str | None = None
-    """What all of the meshes are; by default a folder on the path says so, by name or by synset."""
+    """Category of all meshes; by default that of a folder on the path, by its name or its WordNet synset."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "y"
-    """The axis that points up in the files; a .sh3f library says so itself."""
+    """The axis that points up in the files; not used for .sh3f libraries, which are known to have y up."""
     scale: float | None = None
-    """World units per unit of the files, where sizes matter; by default each mesh gets a box with the diagonal 1."""
+    """World units per unit of the files, to keep relative sizes; by default each mesh is scaled to a bounding box with
+    the diagonal 1."""
     drop_hidden: bool = False
-    """Leave points out of the ground truth that neither a view nor anybody outside can see."""
+    """Leave out ground-truth points that are visible neither in a view nor from anywhere outside."""
     size: int = 224
     """Side of the renders in pixels; 112 is enough for the cpu profile."""
     views: int = 8
-    """Views per mesh, evenly around it."""
+    """Views per mesh, at equal steps around it."""
     elevation: tuple[float, float] = (-20.0, 40.0)
     """Lowest and highest elevation of the cameras in degrees."""
     distance: float = 2.0
-    """Of the cameras from the middle of the mesh."""
+    """Distance of the cameras from the middle of the mesh, in world units."""
     focal: float = 1.875
-    """Focal length over the side of the renders; 1.875 is 420 pixels at 224."""
+    """Focal length, as a multiple of the side of the renders; 1.875 is 420 pixels at 224."""
     seed: int = 0
-    """Seeds cameras, surface samples and the split."""
+    """Seed of cameras, surface samples and the split."""
     processes: int | None = None
-    """How many work at once; one per core by default."""
+    """Number of worker processes; one per core by default."""
 
     def run(self) -> None:
         from train.data.meshes import MeshOptions, convert
@@ -93,22 +100,22 @@ class Meshes:
 
 @dataclasses.dataclass
 class Photos:
-    """Cut objects out of photographs: alone on white, in a square, as large as in training; no cameras needed.
+    """Cut objects out of photographs, for `reconstruct`: centred on white, at the scale of training pictures.
 
-    One folder for each object, one folder of one object, or Stanford Online Products. The object is told from the rest
-    by a mask beside the photograph (NAME_mask.png or masks/NAME.png), by transparency, or by a plain background.
+    The folder holds photographs of one object, one folder for each object, or Stanford Online Products. The object is
+    found by a mask beside the photograph (NAME_mask.png or masks/NAME.png), by transparency, or by a plain background.
     """
 
     source: Positional[Path]
     """Folder of the photographs."""
     out: Path
-    """New folder: OUT/OBJECT/NAME.png to reconstruct from, and OUT/OBJECT/masks/NAME.png to look at."""
+    """New folder: OUT/OBJECT/NAME.png are the pictures, OUT/OBJECT/masks/NAME.png the masks to check by eye."""
     size: int = 224
     """Side of the pictures in pixels."""
     fewest: int = 1
-    """Leave out objects with fewer photographs."""
+    """Leave out objects with fewer photographs than this."""
     objects: int | None = None
-    """At most so many objects."""
+    """Use at most this many objects; all if not given."""
 
     def run(self) -> None:
         from train.data.photos import convert_photos
@@ -121,7 +128,10 @@ class Photos:
 
 @dataclasses.dataclass
 class Check:
-    """Look through a data tree: what is there, what is broken, whether cameras, depth and clouds agree."""
+    """Check a data tree: count its shapes, name broken files, test that cameras, depth and clouds agree.
+
+    The exit code is 1 if there are problems.
+    """
 
     data: Positional[Path]
     """Root of the data tree."""
@@ -136,16 +146,16 @@ class Check:
 
 @dataclasses.dataclass
 class Show:
-    """Draw a contact sheet for each category of a data tree: views, depth, and the cloud from front and back."""
+    """Draw a picture of each category of a data tree: views, depth, and the cloud from front and back."""
 
     data: Positional[Path]
     """Root of the data tree."""
     out: Path | None = None
-    """Folder of the sheets; contact/ in the data tree if not given."""
+    """Folder for the pictures; contact/ in the data tree if not given."""
     categories: tuple[str, ...] = ()
-    """Categories to draw; none means all."""
+    """Categories to draw; all if not given."""
     shapes: int = 8
-    """Shapes on a sheet, evenly spread over the category."""
+    """Shapes in each picture, evenly spread over the category."""
 
     def run(self) -> None:
         from train.data.contact_sheet import show
@@ -158,37 +168,40 @@ class Show:
 
 @dataclasses.dataclass
 class Rules:
-    """Measure whether the fronts of the families hide their backs; see docs/families.md."""
+    """Measure the ambiguity of the procedural categories: front views must hide different backs.
+
+    See docs/families.md for the rules. The exit code is 1 if an object breaks one.
+    """
 
     data: Path | None = None
-    """Measure every object of this procedural data tree, not fresh ones."""
+    """Measure the objects of this procedural data tree; newly generated objects if not given."""
     categories: tuple[str, ...] = ()
-    """Families to measure; none means all that have designed ambiguity."""
+    """Categories to measure; all seven with designed ambiguity if not given."""
     objects: int = 20
-    """Objects of each family."""
+    """Number of newly generated objects of each category."""
     seed: int = 0
-    """Draws the objects."""
+    """Seed of the first newly generated object."""
     pictures: Path | None = None
-    """Folder for a picture of each family, front and backs; of all thirteen if no categories are given."""
+    """Also write a picture of each category, front and backs, to this folder; of all thirteen without --categories."""
 
     def run(self) -> int:
+        from train.data.ambiguity_check import measure_families, measure_tree
         from train.data.families import FAMILIES
-        from train.data.portraits import draw_families
-        from train.data.rules import measure, measure_tree
+        from train.data.family_pictures import draw_families
 
         if self.pictures is not None:
             draw_families(self.pictures, self.categories or tuple(FAMILIES), seed=self.seed)
         if self.data is not None:
             report = measure_tree(self.data)
         else:
-            report = measure(self.categories or None, objects=self.objects, seed=self.seed)
+            report = measure_families(self.categories or None, objects=self.objects, seed=self.seed)
         print(report.summary())
         return 1 if report.broken else 0
 
 
 @dataclasses.dataclass
 class Data:
-    """Make a data tree, or look through one."""
+    """Make a data tree, check it, or draw it."""
 
     action: OmitArgPrefixes[
         Annotated[Procedural, subcommand("procedural")]

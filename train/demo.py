@@ -8,19 +8,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from train.config import PROFILES, FitConfig, scaled
+from train.config import FitConfig, scaled
 from train.data import ShapeTree
 from train.data.procedural import generate
-from train.data.store import render_folder
+from train.data.tree_files import render_folder
 from train.evaluation.evaluate import evaluate
 from train.evaluation.reconstruct import reconstruct_to_files
 from train.evaluation.report import write_report
 from train.evaluation.runs import best_weights
 from train.files import write_text
+from train.methods import recipe
 from train.training.trainer import fit
 
 # Two fifths of the profile's steps: about six minutes on two cores, and past the point where more views help.
-DEMO_CONFIG = scaled(PROFILES["cpu"], 0.4)
+DEMO_CONFIG = scaled(recipe("ours", "cpu"), 0.4)
 _RENDER_SIZE = 112
 _CATEGORIES = ("chair", "display")  # two that so short a training can learn
 

@@ -1,8 +1,8 @@
-"""The group of processes that share a batch: one alone, or those that torchrun has started.
+"""The processes that share a batch: a single one, or those that torchrun has started.
 
-All of them draw the same random numbers and take equal parts of every batch; then the mean of their gradients is
-the gradient of one process on the whole. The means are taken by hand and not in a wrapper around the networks,
-because the critic's penalty differentiates twice and the generator is called by parts.
+All processes draw the same random numbers and take equal parts of every batch, so that the mean of their gradients is
+the gradient of one process on the whole batch. The means are computed here and not by a wrapper around the networks,
+because the critic's penalty differentiates twice and the generator is called in parts.
 """
 
 from __future__ import annotations
@@ -22,84 +22,84 @@ if TYPE_CHECKING:
 
 
 class World:
-    """One process, which needs nobody. Its share of anything is all of it."""
+    """A single process: collectives are no-ops, and its shard of a batch is the whole batch."""
 
     rank, size = 0, 1
 
     @property
-    def writes(self) -> bool:
-        """Does this process write files? One of the group does."""
+    def is_main(self) -> bool:
+        """Is this the one process that writes files?"""
         return self.rank == 0
 
-    def share(self, values: Tensor, dim: int = 0) -> Tensor:
-        """This process's equal part of what the whole group drew alike."""
+    def shard(self, values: Tensor, dim: int = 0) -> Tensor:
+        """This process's equal part of a batch that all processes drew identically."""
         part = values.shape[dim] // self.size
         return values.narrow(dim, self.rank * part, part)
 
     def average_gradients(self, network: nn.Module) -> None:
-        """Makes every process's gradients the mean over all of them."""
+        """Replaces every process's gradients by the mean over all processes."""
 
     def sum(self, values: Tensor) -> Tensor:
-        """The sum of every process's tensor, on all of them."""
+        """All-reduce: the sum over the processes' tensors."""
         return values
 
     def mean(self, values: Tensor) -> Tensor:
-        """The mean of every process's tensor, on all of them."""
+        """All-reduce: the mean over the processes' tensors."""
         return self.sum(values) / self.size
 
     def any(self, flag: bool) -> bool:
-        """Is it true in any process?"""
+        """Is `flag` true in any process?"""
         return flag
 
-    def wait(self) -> None:
-        """Until all have come here."""
+    def barrier(self) -> None:
+        """Waits until all processes have reached this call."""
 
 
-ALONE = World()
+SINGLE = World()
 
 
 class Group(World):
-    """The processes that Lightning Fabric has connected."""
+    """Processes connected by Lightning Fabric."""
 
     def __init__(self, fabric: Fabric) -> None:
         self._fabric = fabric
         self.rank, self.size = fabric.global_rank, fabric.world_size
 
     def average_gradients(self, network: nn.Module) -> None:
-        """One message for all gradients; a parameter without one is left out everywhere alike."""
+        """One message for all gradients. A parameter without a gradient has none in every process."""
         gradients = [p.grad for p in network.parameters() if p.grad is not None]
         mean = self.mean(torch.cat([gradient.reshape(-1) for gradient in gradients]))
         for gradient, part in zip(gradients, mean.split([g.numel() for g in gradients]), strict=True):
             gradient.copy_(part.view_as(gradient))
 
     def sum(self, values: Tensor) -> Tensor:
-        """The sum of every process's tensor, on all of them."""
+        """All-reduce: the sum over the processes' tensors."""
         total = self._fabric.all_reduce(values.clone(), reduce_op="sum")
         assert isinstance(total, Tensor)
         return total
 
     def any(self, flag: bool) -> bool:
-        """Is it true in any process?"""
+        """Is `flag` true in any process?"""
         return bool(self.sum(torch.tensor(float(flag))) > 0)
 
-    def wait(self) -> None:
-        """Until all have come here."""
+    def barrier(self) -> None:
+        """Waits until all processes have reached this call."""
         self._fabric.barrier()
 
 
 @functools.cache
-def gather() -> World:
-    """The group of processes that torchrun started this one in; every one of them must call it.
+def connect() -> World:
+    """Connects the processes that torchrun started; every one of them must call it.
 
     The cores of a machine are divided among its processes, for torch and for the kernels.
 
     Raises:
-        UserError: there is a group, and Lightning Fabric is not installed.
+        UserError: there are several processes, and Lightning Fabric is not installed.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return ALONE
+        return SINGLE
     try:
-        from lightning_fabric import Fabric  # not needed, and not paid for, by one process
+        from lightning_fabric import Fabric  # a single process does not need it
     except ImportError:
         raise UserError(
             "more than one process needs Lightning Fabric: pip install lightning-fabric"

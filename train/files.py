@@ -1,7 +1,8 @@
-"""Writing so that a reader never sees half a file."""
+"""Atomic writes: a reader sees the old file or the whole new one, never half of it."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -11,13 +12,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS})
+"""Errors after which no other file can be written either: the disk is full or read-only."""
+
 
 @contextmanager
-def replacing(target: Path) -> Iterator[Path]:
+def replacing(target: str | Path) -> Iterator[Path]:
     """Yields a temporary path beside `target`; what is written there becomes `target` on success.
 
     The path may be made a file, which replaces an old one in one step, or a directory, whose target must be new.
     """
+    target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
@@ -27,14 +32,15 @@ def replacing(target: Path) -> Iterator[Path]:
         remove(temporary)
 
 
-def write_text(target: Path, text: str) -> None:
+def write_text(target: str | Path, text: str) -> None:
     """Writes a text file atomically."""
     with replacing(target) as temporary:
         temporary.write_text(text)
 
 
-def kept(path: Path, key: Any, make: Callable[[], Any]) -> Any:
+def kept(path: str | Path, key: Any, make: Callable[[], Any]) -> Any:
     """What was kept at `path` under the same key; else made now, and kept. Both are plain JSON values."""
+    path = Path(path)
     if path.exists():
         saved = json.loads(path.read_text())
         if saved["key"] == key:
@@ -44,8 +50,9 @@ def kept(path: Path, key: Any, make: Callable[[], Any]) -> Any:
     return result
 
 
-def remove(path: Path) -> None:
+def remove(path: str | Path) -> None:
     """Deletes a file or a directory tree, if it is there."""
+    path = Path(path)
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     else:

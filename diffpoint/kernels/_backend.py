@@ -1,13 +1,7 @@
-"""The one import of the kernel compiler: Taichi, or its maintained fork where Taichi has no wheel."""
+"""The compiler of the kernels, under the name that their sources use."""
 
-import os
+from diffpoint._backend import import_backend
 
-if os.environ.get("DIFFPOINT_BACKEND") == "quadrants":
-    import quadrants as ti
-else:
-    try:
-        import taichi as ti
-    except ImportError:
-        import quadrants as ti
+ti = import_backend()
 
 __all__ = ["ti"]

@@ -1,4 +1,4 @@
-"""The methods that the paper compares itself with; two more are the conditional generator with other losses."""
+"""Networks of the methods that the paper compares with; others of them train the conditional generator differently."""
 
 from __future__ import annotations
 

@@ -1,20 +1,21 @@
-"""What the other methods' networks have in common: how they are called, and how they are scored."""
+"""What the networks of the baselines have in common: they take no random codes, and predict without a graph."""
 
 from __future__ import annotations
 
 import dataclasses
-from abc import ABC, abstractmethod
-from typing import ClassVar, TypeVar
+from abc import abstractmethod
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from models.parts import prepare_images
+from models.predictor import Predictor
 
 
 @dataclasses.dataclass(frozen=True)
 class BaselineConfig:
-    """What every one of them has: its input size, and how many points stand for its shape.
+    """What every baseline has: its input size, and the number of points of its predictions in comparisons.
 
     Attributes:
         profile: name of the size, for the record.
@@ -29,67 +30,36 @@ class BaselineConfig:
     image_width: int = 64
     points: int = 512
 
-    deterministic: ClassVar[bool] = True
-    """They take no random codes."""
 
+class Baseline(Predictor):
+    """A predictor without random codes: it accepts codes of length 0.
 
-class Baseline(nn.Module, ABC):
-    """Images in, clouds in the world frame out.
-
-    It is called like a generator: `network(images, codes)`, with codes of no numbers at all. Predictions are made as
-    after training, whatever the mode: no graph, running statistics in batch norms. What a loss needs on the way to the
-    clouds is each network's own.
+    Predictions are always made in eval mode (running statistics in batch norms) and without a graph, whatever mode the
+    network is in. What its loss needs on the way to the clouds are methods of each network.
     """
-
-    code_dim = 0
-    reads_views_together: ClassVar[bool] = False
-    """Does it make one cloud of several images? Otherwise each of them gives its own."""
 
     config: BaselineConfig
 
-    @property
-    def points(self) -> int:
-        """To how many points its clouds are thinned for comparisons."""
-        return self.config.points
-
-    @property
-    def profile(self) -> str:
-        """Name of the size this network was built to."""
-        return self.config.profile
-
     def forward(self, images: Tensor, codes: Tensor) -> Tensor:
-        """(B, 3, H, W) images in [0, 1] on white and (R, B, 0) codes -> (R, B, N, 3), the same R times."""
-        if codes.ndim != 3 or codes.shape[1:] != (len(images), self.code_dim):
-            raise ValueError(
-                f"{type(self).__name__}: 'codes' must be (R, {len(images)}, {self.code_dim}) to match the images; "
-                f"got {tuple(codes.shape)}"
-            )
-        clouds = self.answers(images[:, None])[:, 0]
+        """(B, 3, H, W) images and (R, B, 0) codes -> (R, B, N, 3), the same prediction R times."""
+        self.check_codes(codes, len(images))
+        clouds = self.predict_views(images[:, None])[:, 0]
         return clouds.expand(len(codes), *clouds.shape)
 
     @torch.no_grad()
-    def answers(self, images: Tensor) -> Tensor:
-        """What it says to V images of each of B objects, as clouds that are to be judged one by one.
-
-        Args:
-            images: (B, V, 3, H, W) in [0, 1] on white, any H and W.
-
-        Returns:
-            (B, A, N, 3) points in the world frame; A is V, or 1 for a network that reads views together.
-        """
-        if images.ndim != 5 or images.shape[2] != 3 or 0 in images.shape:
-            raise ValueError(
-                f"{type(self).__name__}: 'images' must be (B, V, 3, H, W) in [0, 1]; got {tuple(images.shape)}"
-            )
+    def predict_views(self, images: Tensor, codes: Tensor | None = None) -> Tensor:
+        """(B, V, 3, H, W) images -> (B, K, N, 3) points, K = 1 where views are read together; codes are ignored."""
+        del codes
+        self.check_views(images)
         training = self.training
         self.eval()
-        clouds = self._answers(images)
+        clouds = self._predict(images)
         self.train(training)
         return clouds
 
     @abstractmethod
-    def _answers(self, images: Tensor) -> Tensor:
-        """`answers`, in eval mode and without a graph."""
+    def _predict(self, images: Tensor) -> Tensor:
+        """`predict_views` in eval mode and without a graph."""
 
     def _prepare(self, images: Tensor) -> Tensor:
         """(B, 3, H, W) in [0, 1] -> (B, 3, image_height, image_width), centred."""
@@ -120,7 +90,7 @@ def initialise_rectified(network: nn.Module) -> None:
         if isinstance(module, (nn.Conv2d, nn.Conv3d, nn.Linear)):
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
         elif isinstance(module, nn.ConvTranspose3d):
-            # A value of the output meets as many inputs as strided taps reach it.
+            # Of a strided transposed kernel only a part of the taps contributes to each output value.
             taps = 1.0
             for side, stride in zip(module.kernel_size, module.stride, strict=True):
                 taps *= side / stride

@@ -1,7 +1,7 @@
-"""Lin et al.: one image -> depth maps and masks of the shape as eight fixed cameras would see it, fused to one cloud.
+"""Lin et al.: one image -> depth maps and masks of the shape in eight fixed views, fused into one cloud.
 
-The cameras stand in the corners of a cube around the object and look at its centre; they are orthographic, and the map
-of each covers one unit of the world from side to side.
+The cameras are at the corners of a cube around the object and look at its centre; they are orthographic, and each map
+is one world unit wide.
 
 Source: Lin, Kong, Lucey, "Learning efficient point cloud generation for dense 3D object reconstruction" (AAAI 2018).
 """
@@ -31,8 +31,8 @@ class LinConfig(BaselineConfig):
     Attributes:
         width: factor on all hidden channels; 1 is the paper's.
         map_size: side of the eight maps, 4 times a power of two.
-        batch_momentum: how much a batch counts in the running statistics; less in longer trainings.
-        upsample: how many times larger than the true depth maps those of the pseudo-renderer are, in training.
+        batch_momentum: momentum of the batch norms' running statistics; smaller in longer trainings.
+        upsample: size of the pseudo-renderer's depth maps in training, as a multiple of the true ones.
     """
 
     width: float = 0.25
@@ -65,12 +65,12 @@ def build_lin(profile: str = "cpu", *, config: LinConfig | None = None) -> Struc
 
 
 class Structure(NamedTuple):
-    """What the eight fixed cameras see.
+    """The maps of the eight fixed cameras.
 
     Attributes:
-        pixels: (B, 8, 2, S, S) where each pixel's point is, x and y in pixels of the map.
-        depth: (B, 8, S, S) the point's depth; every camera stands one unit from the origin.
-        logits: (B, 8, S, S) above 0 where there is something to see.
+        pixels: (B, 8, 2, S, S) position of each pixel's point, x and y in pixels of the map.
+        depth: (B, 8, S, S) the point's depth; every camera is one unit from the origin.
+        logits: (B, 8, S, S) mask logits: above 0 where the pixel shows the object.
     """
 
     pixels: Tensor
@@ -128,7 +128,7 @@ class StructureGenerator(Baseline):
         self.register_buffer("world_from_cams", _fixed_poses().inverse(), persistent=False)
 
     def structure(self, images: Tensor) -> Structure:
-        """(B, 3, H, W) in [0, 1] -> what the eight cameras see; with gradient, by the network's mode."""
+        """(B, 3, H, W) in [0, 1] -> the eight cameras' maps; with gradient, in the network's current mode."""
         maps = self.maps(self.decoder(self.encoder(self._prepare(images))))
         size = self.config.map_size
         x, y, depth, logits = (maps.unflatten(1, (4, _VIEWS)) + self.map_bias).unbind(1)
@@ -136,21 +136,21 @@ class StructureGenerator(Baseline):
         return Structure(torch.stack([x, y], 2), depth, logits)
 
     def fuse(self, structure: Structure) -> Tensor:
-        """The points of all eight maps, of empty pixels too: (B, 8*S*S, 3) in the world frame, camera by camera."""
+        """The points of all eight maps, masked or not: (B, 8*S*S, 3) in the world frame, camera by camera."""
         across = structure.pixels / self.config.map_size - 0.5
         in_cams = torch.cat([across, structure.depth[:, :, None]], 2).flatten(3)
         turned = self.world_from_cams[:, :3, :3] @ in_cams + self.world_from_cams[:, :3, 3:]
         return turned.transpose(2, 3).flatten(1, 2)
 
-    def answer_of(self, structure: Structure) -> Tensor:
-        """The points of the pixels that are not empty, some left out or repeated: (B, 2*S*S, 3) in the world frame."""
+    def cloud_of(self, structure: Structure) -> Tensor:
+        """The points inside the masks, subsampled or repeated to a fixed number: (B, 2*S*S, 3) in the world frame."""
         clouds, kept = self.fuse(structure), structure.logits.flatten(1) > 0
         count = kept.shape[1] // 4  # about as many pixels as an object covers
-        answers = [_spread_over(cloud[_some(mask)], count) for cloud, mask in zip(clouds, kept, strict=True)]
-        return torch.stack(answers)
+        picked = [_resample(cloud[_some(mask)], count) for cloud, mask in zip(clouds, kept, strict=True)]
+        return torch.stack(picked)
 
-    def _answers(self, images: Tensor) -> Tensor:
-        return self.answer_of(self.structure(images.flatten(0, 1))).unflatten(0, images.shape[:2])
+    def _predict(self, images: Tensor) -> Tensor:
+        return self.cloud_of(self.structure(images.flatten(0, 1))).unflatten(0, images.shape[:2])
 
 
 def fixed_cameras(points: Tensor) -> Tensor:
@@ -165,7 +165,7 @@ def fixed_cameras(points: Tensor) -> Tensor:
 
 
 def pixel_centres(size: int) -> Tensor:
-    """(2, S, S): where the pixels of a map are, x and y in pixels.
+    """(2, S, S): centres of a map's pixels, x and y in pixels.
 
     Example:
         >>> pixel_centres(4)[:, 0, 3].tolist()
@@ -176,23 +176,23 @@ def pixel_centres(size: int) -> Tensor:
 
 
 def _fixed_poses() -> Tensor:
-    """(8, 4, 4) camera from world: a cube's corners, one unit from the origin."""
+    """(8, 4, 4) cam_from_world of cameras at a cube's corners, one unit from the origin."""
     corners = torch.tensor(list(itertools.product((-1.0, 1.0), repeat=3))) / math.sqrt(3)
     poses = [PinholeCamera.look_at(eye, focal_px=1.0, height=1, width=1).cam_from_world for eye in corners]
     return torch.stack(poses).reshape(_VIEWS, 4, 4)
 
 
 def _flat_maps(size: int) -> Tensor:
-    """(4, 8, S, S): every pixel at its centre and at the origin's depth, undecided whether it is empty."""
+    """(4, 8, S, S): every pixel's point at the pixel's centre and at the origin's depth, with a mask logit of 0."""
     maps = torch.cat([pixel_centres(size), torch.ones(1, size, size), torch.zeros(1, size, size)])
     return maps[:, None].repeat(1, _VIEWS, 1, 1)
 
 
 def _some(mask: Tensor) -> Tensor:
-    """The mask, or all if it is empty: a cloud has to have points."""
+    """The mask, or an all-true one if it is empty: a prediction must have points."""
     return mask if bool(mask.any()) else torch.ones_like(mask)
 
 
-def _spread_over(cloud: Tensor, count: int) -> Tensor:
-    """(n, 3) -> (count, 3): evenly spread over the list, some left out or some repeated."""
+def _resample(cloud: Tensor, count: int) -> Tensor:
+    """(n, 3) -> (count, 3): indices spaced evenly over the list, with omissions or repeats."""
     return cloud[torch.arange(count) * len(cloud) // count]

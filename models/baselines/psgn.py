@@ -1,8 +1,8 @@
-"""PSGN: one image -> one cloud, by the two-branch network from which the conditional generator was made.
+"""PSGN: one image -> one cloud, by the two-branch network on which the conditional generator is based.
 
-It is the deterministic counterpart of that generator, layer by layer; what makes it another method is its
-training: it sees whole clouds. The first version of the published network took a fourth channel, the object's mask,
-and gave 256 + 768 points; this one takes the same images as all others here and gives 512 + 1536.
+It is that generator without its code branch, layer by layer; the difference lies in the training, which uses the whole
+ground-truth clouds. The first published version took the object's mask as a fourth channel and predicted 256 + 768
+points; this one takes the same images as all other networks here and predicts 512 + 1536.
 
 Source: Fan, Su, Guibas, "A point set generation network for 3D object reconstruction from a single image" (CVPR 2017),
 with the sizes of the CVPR 2019 paper.

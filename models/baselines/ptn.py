@@ -1,8 +1,8 @@
-"""PTN: one image -> an occupancy grid, taught by the silhouettes that cameras see of it.
+"""PTN: one image -> an occupancy grid, supervised by silhouettes.
 
-The perspective transformer samples the grid along the rays of a camera; a pixel's silhouette is the largest occupancy
-on its ray. The published network first learns its encoder by rotating objects; here it is trained jointly from the
-start.
+The perspective transformer samples the grid along the rays of a camera; a pixel's silhouette value is the largest
+occupancy on its ray. The published network pre-trains its encoder by rotating objects; here all parts are trained
+jointly from the start.
 
 Source: Yan, Yang, Yumer, Guo, Lee, "Perspective transformer nets: Learning single-view 3D object reconstruction without
 3D supervision" (NeurIPS 2016).
@@ -24,10 +24,10 @@ from models.baselines.voxels import cell_centres, surface_points
 _THRESHOLD = 0.5
 _RAY_SAMPLES = 32
 _GRID_SIZE = 32
-# World units, and half a cell more: an object has a diagonal of one. Cells beyond it, into which not every camera
-# looks, would never be emptied.
+# World units: half an object's diagonal of one, plus half a cell. Cells beyond it are not in every camera's view and
+# would never be emptied.
 _OBJECT_RADIUS = 0.5 + 0.5 / _GRID_SIZE
-# The cube [-0.5, 0.5]^3 seen from any side lies within this distance of the origin's depth.
+# From every direction, the cube [-0.5, 0.5]^3 is within this distance of the origin's depth.
 _HALF_DIAGONAL = math.sqrt(3) / 2
 
 
@@ -36,10 +36,10 @@ class PTNConfig(BaselineConfig):
     """Everything that fixes the network's shape; the grid has 32^3 cells.
 
     Attributes:
-        encoder: channels of the convolutions that halve the image.
-        features: length of an image's vector, after two layers of `hidden`.
-        hidden: see `features`.
-        decoder: channels of the first 3^3 cells and of the two grids between them and the last.
+        encoder: channels of the convolutions, each of which halves the image.
+        hidden: width of the two fully connected layers after them.
+        features: length of the feature vector after these.
+        decoder: channels of the 3^3 cells and of the two larger grids before the output.
     """
 
     encoder: tuple[int, int, int] = (16, 32, 64)
@@ -71,7 +71,7 @@ def build_ptn(profile: str = "cpu", *, config: PTNConfig | None = None) -> Silho
 
 
 class SilhouetteReconstruction(Baseline):
-    """One image -> occupancies in [0, 1], 0 beyond the ball of an object's size."""
+    """One image -> occupancies in [0, 1], 0 outside the ball around an object."""
 
     config: PTNConfig
     inside: Tensor
@@ -99,7 +99,7 @@ class SilhouetteReconstruction(Baseline):
         assert isinstance(last, nn.ConvTranspose3d)
         assert last.bias is not None
         with torch.no_grad():
-            # All cells start nearly undecided, and those that no ray meets stay empty.
+            # Before training, all occupancies are near 0.27: cells that no ray crosses stay below the threshold.
             last.weight.mul_(0.1)
             last.bias.fill_(-1.0)
         inside = cell_centres(_GRID_SIZE).norm(dim=1) <= _OBJECT_RADIUS
@@ -114,21 +114,21 @@ class SilhouetteReconstruction(Baseline):
         """(B, 3, H, W) in [0, 1] -> (B, 32, 32, 32) in [0, 1], with gradient."""
         return self.inside * self.decoder(self.encoder(self._prepare(images)))[:, 0].sigmoid()
 
-    def _answers(self, images: Tensor) -> Tensor:
+    def _predict(self, images: Tensor) -> Tensor:
         occupancy = self.occupancy(images.flatten(0, 1))
         points = surface_points(occupancy, self.points, threshold=_THRESHOLD)
         return points.unflatten(0, images.shape[:2])
 
 
 def silhouettes(occupancy: Tensor, camera: PinholeCamera, *, samples: int = _RAY_SAMPLES) -> Tensor:
-    """The perspective transformer: how solid the grid looks in each pixel.
+    """The perspective transformer: silhouettes of an occupancy grid.
 
-    Every ray is sampled at equal steps of depth, where it can meet the cube [-0.5, 0.5]^3; outside the grid is empty.
+    Every ray is sampled at equal steps of depth within the cube [-0.5, 0.5]^3; outside the grid is empty.
 
     Args:
         occupancy: (B, G, G, G) in [0, 1], along x, y and z of the world.
         camera: (B, V), with the size of the maps.
-        samples: per ray.
+        samples: number of samples on each ray.
 
     Returns:
         (B, V, H, W) in [0, 1], the largest occupancy on the ray, interpolated between cells.
@@ -153,7 +153,7 @@ def silhouettes(occupancy: Tensor, camera: PinholeCamera, *, samples: int = _RAY
     middle = camera.cam_from_world[..., 2, 3]
     depth = middle[..., None] + torch.linspace(-_HALF_DIAGONAL, _HALF_DIAGONAL, samples).to(occupancy)
     places = camera.position[..., None, None, :] + depth[..., None, None] * rays[:, :, None]
-    # The last of a place's coordinates comes first in grid_sample, and the grid's border is at 1.
+    # grid_sample takes coordinates in the order z, y, x, and the grid's border is at 1.
     grid = 2 * places.flip(-1).reshape(batch, views * samples, height * width, 1, 3)
     found = F.grid_sample(occupancy[:, None], grid, align_corners=False)
     return found.reshape(batch, views, samples, height, width).amax(2)

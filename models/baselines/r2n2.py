@@ -1,4 +1,4 @@
-"""3D-R2N2: images, one after another, update a grid of memory cells, from which an occupancy grid is decoded.
+"""3D-R2N2: a recurrent network reads images one by one into a grid of hidden states; an occupancy grid is decoded.
 
 This is the deeper of the published networks, with residual blocks and a gated recurrent unit ("Res3D-GRU-3").
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -22,8 +21,8 @@ from models.baselines.voxels import surface_points
 _MEMORY_SIDE = 4
 _SLOPE = 0.01
 _THRESHOLD = 0.4
-_EMPTIER = 1.5
-"""Logits of a cell before training: it is filled with a probability of 5 %."""
+_EMPTY_LOGIT = 1.5
+"""Logits of a cell before training, empty and (negated) occupied: an occupancy of 5 %."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,11 +30,11 @@ class R2N2Config(BaselineConfig):
     """Everything that fixes the network's shape.
 
     Attributes:
-        encoder: channels of the blocks that halve the image.
-        skips: which of them add their input to their output.
-        features: length of an image's vector.
-        memory: channels of the 4^3 memory cells.
-        decoder: channels of the blocks that double the grid, and last of the one that does not.
+        encoder: channels of the blocks, each of which halves the image.
+        skips: which of the blocks have a residual connection.
+        features: length of an image's feature vector.
+        memory: channels of the 4^3 hidden states.
+        decoder: channels of the blocks that double the grid, then of the last block, which does not.
     """
 
     encoder: tuple[int, ...] = (16, 32, 64, 64)
@@ -69,7 +68,7 @@ def build_r2n2(profile: str = "cpu", *, config: R2N2Config | None = None) -> Rec
 
     Example:
         >>> model = build_r2n2("smoke")
-        >>> model.answers(torch.rand(2, 3, 3, 56, 56)).shape  # three images of each of two objects
+        >>> model.predict_views(torch.rand(2, 3, 3, 56, 56)).shape  # three images of each of two objects
         torch.Size([2, 1, 128, 3])
     """
     return RecurrentReconstruction(choose_config("build_r2n2", R2N2_PROFILES, profile, config))
@@ -78,7 +77,7 @@ def build_r2n2(profile: str = "cpu", *, config: R2N2Config | None = None) -> Rec
 class RecurrentReconstruction(Baseline):
     """Images of one object, any number of them -> the logits of an occupancy grid."""
 
-    reads_views_together: ClassVar[bool] = True
+    reads_views_together = True
     config: R2N2Config
 
     def __init__(self, config: R2N2Config) -> None:
@@ -108,9 +107,9 @@ class RecurrentReconstruction(Baseline):
         for module in self.modules():
             if isinstance(module, (_ImageBlock, _GridBlock, _GatedMemory)):
                 module.initialise()
-        # Most cells are empty, and the first steps need not be spent on that.
-        self.logits_of_cells.bias = nn.Parameter(torch.tensor([_EMPTIER, -_EMPTIER]))
-        # A fifth of a training step's time on a CPU.
+        # Most cells are empty; without this bias, training spends its first steps on learning that.
+        self.logits_of_cells.bias = nn.Parameter(torch.tensor([_EMPTY_LOGIT, -_EMPTY_LOGIT]))
+        # Saves a fifth of a training step's time on a CPU.
         for module in self.modules():
             if isinstance(module, (nn.Conv3d, nn.ConvTranspose3d)):
                 module.to(memory_format=torch.channels_last_3d)  # pyright: ignore[reportCallIssue]
@@ -121,20 +120,20 @@ class RecurrentReconstruction(Baseline):
         return _MEMORY_SIDE * 2 ** (len(self.config.decoder) - 1)
 
     def logits(self, images: Tensor) -> Tensor:
-        """(B, V, 3, H, W) in [0, 1], read in order -> (B, 2, G, G, G): how empty and how occupied each cell is."""
+        """(B, V, 3, H, W) in [0, 1], read in order -> (B, 2, G, G, G): logits of each cell, empty and occupied."""
         features = self.encoder(self._prepare(images.flatten(0, 1))).unflatten(0, images.shape[:2])
         memory = features.new_zeros(len(images), self.config.memory, *(_MEMORY_SIDE,) * 3)
         for view in features.unbind(1):
             memory = self.memory(view, memory)
         return self.logits_of_cells(self.decoder(memory))
 
-    def _answers(self, images: Tensor) -> Tensor:
+    def _predict(self, images: Tensor) -> Tensor:
         occupancy = self.logits(images).softmax(1)[:, 1]
         return surface_points(occupancy, self.points, threshold=_THRESHOLD)[:, None]
 
 
 class _ImageBlock(nn.Module):
-    """Two rectified convolutions, perhaps their input beside them, then half the size (and one more)."""
+    """Two convolutions with leaky ReLU, an optional residual connection, and max pooling to half the size plus one."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, *, skip: bool) -> None:
         super().__init__()
@@ -156,23 +155,23 @@ class _ImageBlock(nn.Module):
 
 
 class _GatedMemory(nn.Module):
-    """A gated recurrent unit on a grid: each cell hears its neighbours, and the image by weights of its own."""
+    """A convolutional gated recurrent unit: each cell sees its neighbours, and the image through weights of its own."""
 
     def __init__(self, features: int, channels: int) -> None:
         super().__init__()
         shape = (channels, *(_MEMORY_SIDE,) * 3)
         cells = channels * _MEMORY_SIDE**3
 
-        def hear_image() -> nn.Module:
+        def from_image() -> nn.Module:
             return nn.Sequential(nn.Linear(features, cells, bias=False), nn.Unflatten(1, shape))
 
-        self.keep_image, self.reset_image, self.new_image = hear_image(), hear_image(), hear_image()
+        self.keep_image, self.reset_image, self.new_image = from_image(), from_image(), from_image()
         self.keep_cells, self.reset_cells, self.new_cells = (
             nn.Conv3d(channels, channels, 3, padding=1) for _ in range(3)
         )
 
     def initialise(self) -> None:
-        """Gates and candidates are sums of two terms and meet no rectifier; gates start a little open."""
+        """Weights for layers without ReLU, and small positive biases, so that the gates are slightly open at first."""
         for module in self.modules():
             if isinstance(module, (nn.Linear, nn.Conv3d)):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="linear")
@@ -187,7 +186,7 @@ class _GatedMemory(nn.Module):
 
 
 class _Unpool(nn.Module):
-    """Twice the size: every cell goes to the even corner of eight, the other seven are zero."""
+    """Doubles the size: every value goes to the first of 2^3 cells, the other seven are zero."""
 
     def forward(self, x: Tensor) -> Tensor:
         larger = x.new_zeros(*x.shape[:2], *(2 * side for side in x.shape[2:]))
@@ -196,10 +195,10 @@ class _Unpool(nn.Module):
 
 
 class _GridBlock(nn.Module):
-    """Two rectified convolutions beside their input, of the unpooled grid where the block doubles it.
+    """Two convolutions with leaky ReLU and a residual connection, on the unpooled grid if the block doubles it.
 
-    A convolution of an unpooled grid is a transposed one with a stride of 2, which spends no time on the zeros: a
-    quarter of what it takes on the larger grid.
+    A convolution of an unpooled grid equals a transposed convolution with stride 2, which skips the zeros and takes a
+    quarter of the time.
     """
 
     def __init__(self, inputs: int, outputs: int, *, doubles: bool) -> None:
@@ -223,7 +222,7 @@ class _GridBlock(nn.Module):
 
 
 def _halve_second_moment(*paths: nn.Module) -> None:
-    """Two paths are added; grown with every block, the sum would start the memory's gates where they do not learn."""
+    """The sum of two paths must not grow from block to block, or it would saturate the gates of the hidden state."""
     with torch.no_grad():
         for path in paths:
             for weight in path.parameters():

@@ -1,4 +1,4 @@
-"""From a grid of occupied cells to points on its surface.
+"""From an occupancy grid to points on its surface.
 
 A grid (G, G, G) divides the cube [-0.5, 0.5]^3 of the world, along x, y and z in this order.
 """
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-# An answer without a single cell would have no points: then the likeliest cells stand in.
+# Cells that count as occupied where none reaches the threshold: a prediction must have points.
 _FEWEST_CELLS = 8
 
 # The steps of the plane's most even sequence of points (Roberts' generalisation of the golden ratio).
@@ -30,13 +30,13 @@ def cell_centres(size: int) -> Tensor:
 def surface_points(occupancy: Tensor, count: int, *, threshold: float) -> Tensor:
     """Points spread evenly over the faces that separate occupied from empty cells.
 
-    The faces are equal squares; each gets as many points as another, give or take one, at places of a low-discrepancy
-    sequence. Nothing is random.
+    The faces are equal squares; the numbers of their points differ by one at most, and their places follow a
+    low-discrepancy sequence. Deterministic.
 
     Args:
         occupancy: (B, G, G, G) in [0, 1].
         count: points per cloud.
-        threshold: from where on a cell counts as occupied; where none would, the likeliest eight do.
+        threshold: least occupancy of an occupied cell; in a grid without one, the eight most occupied cells count.
 
     Returns:
         (B, count, 3) in the world frame.
@@ -67,7 +67,7 @@ def _on_faces(occupied: Tensor, count: int) -> Tensor:
     face = faces[number * len(faces) // count]
     axis, outward = face[:, 0] // 2, face[:, 0] % 2
     places = (number[:, None] * torch.tensor(_EVEN_STEPS, dtype=torch.float64)) % 1
-    # In the cell: the face's own coordinate is 0 or 1, the other two are places.
+    # Within the cell the coordinate along the face's normal is 0 or 1, the other two are places.
     offset = torch.empty(count, 3)
     across = torch.tensor([[1, 2], [0, 2], [0, 1]])[axis]
     offset.scatter_(1, across, places.float())

@@ -1,8 +1,8 @@
 """A split of the data, ready for the network, and the sampler that draws batches from it.
 
 Images are kept as bytes at the network's input size; depth maps at the size at which the front constraint
-compares, with cameras that fit the smaller maps exactly, so that prediction and observation are made with one
-camera. Both are mapped from files (train/data/cache.py): a batch touches the pages of its own views.
+compares, with cameras that fit the smaller maps exactly, so that prediction and observation share one camera. Both are
+mapped from files (train/data/cache.py): a batch reads the pages of its own views.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from diffpoint import PinholeCamera
-from train.data import ShapeTree
 from train.data.cache import prepare
-from train.data.shrink import Pool, Sizes, SmallShape
+from train.data.shape import Shape
+from train.data.shrink import Pool, Sizes
+from train.data.tree import ShapeTree
 from train.errors import UserError
 
 
@@ -70,16 +71,16 @@ class LoadedSplit:
         return _picked(self.images, shapes, views).float() / 255
 
     def batch(self, shapes: Tensor, views: Tensor) -> Batch:
-        """(B,) shape and (B, V) view numbers -> what one training step needs."""
+        """(B,) shape and (B, V) view numbers -> a batch."""
         picked = (shapes[:, None], views)
         size = self.depth[0].shape[-1]
         camera = PinholeCamera(self.K[picked], self.cam_from_world[picked], size, size)
         return Batch(self.float_images(shapes, views), _picked(self.depth, shapes, views), camera)
 
-    def truth(self, shapes: Tensor) -> Truth:
-        """(B,) shape numbers -> everything known of them."""
+    def targets(self, shapes: Tensor) -> Targets:
+        """(B,) shape numbers -> their whole surfaces and all of their views."""
         seen = self.batch(shapes, torch.arange(self.views).expand(len(shapes), -1))
-        return Truth(self.points[shapes], seen.depth, seen.camera)
+        return Targets(self.points[shapes], seen.depth, seen.camera)
 
     def clouds(self, shapes: Tensor, points: Tensor) -> Tensor:
         """(B,) shape and (B, N) point numbers -> (B, N, 3) of the ground truth."""
@@ -91,8 +92,8 @@ def _picked(values: Sequence[Tensor] | Tensor, shapes: Tensor, views: Tensor) ->
     return torch.stack([values[shape][chosen] for shape, chosen in zip(shapes.tolist(), views, strict=True)])
 
 
-class Truth(NamedTuple):
-    """Everything known of B shapes, with all V views that the data have of them.
+class Targets(NamedTuple):
+    """The ground truth of B shapes: points on the whole surface, and all V views that the data have.
 
     Attributes:
         points: (B, P, 3) on the surface, world frame.
@@ -114,18 +115,18 @@ class Batch(NamedTuple):
         camera: (B, V), of the depth maps.
         real: (K, B, N, 3) ground truth clouds for the critic, first those of the B shapes, then of others; None
             without a critic.
-        truth: the same shapes, for methods that are taught with more than the images' own depth maps; else None.
+        targets: the same shapes, for methods that learn from more than the images' own depth maps; else None.
     """
 
     images: Tensor
     depth: Tensor
     camera: PinholeCamera
     real: Tensor | None = None
-    truth: Truth | None = None
+    targets: Targets | None = None
 
 
 def load_split(
-    data: Path | Sequence[Path],
+    data: str | Path | Sequence[str | Path],
     split: Literal["train", "val", "test"],
     *,
     image_size: tuple[int, int],
@@ -135,9 +136,9 @@ def load_split(
     limit: int | None = None,
     progress: bool = True,
 ) -> LoadedSplit:
-    """Opens a split of one or more data trees; broken shapes are named and left out.
+    """Opens a split of one or more data trees; broken shapes are named on stderr and left out.
 
-    The first time, its pictures are decoded and kept small; see train/data/cache.py.
+    The first time, its pictures are decoded, and what is made of them is kept; see train/data/cache.py.
 
     Args:
         data: root of the tree, or of each.
@@ -156,12 +157,12 @@ def load_split(
     if limit is not None:
         _thin_out(trees, limit)
     sizes = Sizes(image_size, map_size, gt_pool)
-    shapes: list[SmallShape] = []
+    shapes: list[Shape] = []
     for tree in trees:
         prepared = prepare(tree.path, tree.ids, sizes, name=split, progress=progress)
         for name in tree.ids:
             small = prepared[name]
-            if isinstance(small, SmallShape):
+            if isinstance(small, Shape):
                 shapes.append(small)
             else:
                 tree.skipped[name] = str(small)
@@ -175,16 +176,16 @@ def load_split(
     return LoadedSplit(
         images=[shape.images for shape in shapes],
         depth=[shape.depth for shape in shapes],
-        K=torch.stack([shape.K for shape in shapes]),
-        cam_from_world=torch.stack([shape.cam_from_world for shape in shapes]),
+        K=torch.stack([shape.camera.K for shape in shapes]),
+        cam_from_world=torch.stack([shape.camera.cam_from_world for shape in shapes]),
         points=torch.stack([shape.points for shape in shapes]),
         ids=[shape.id for shape in shapes],
         categories=[shape.category for shape in shapes],
     )
 
 
-def _roots(data: Path | Sequence[Path]) -> list[Path]:
-    return [data] if isinstance(data, Path) else list(data)
+def _roots(data: str | Path | Sequence[str | Path]) -> list[Path]:
+    return [Path(root) for root in ([data] if isinstance(data, str | Path) else data)]
 
 
 def _thin_out(trees: Sequence[ShapeTree], limit: int) -> None:
@@ -199,7 +200,7 @@ def _thin_out(trees: Sequence[ShapeTree], limit: int) -> None:
         start += len(ids)
 
 
-def _of_the_usual_size(shapes: list[SmallShape], skipped: dict[str, str]) -> list[SmallShape]:
+def _of_the_usual_size(shapes: list[Shape], skipped: dict[str, str]) -> list[Shape]:
     """Keeps the shapes with the most common numbers of views and points; names the others in `skipped`."""
     if not shapes:
         return shapes

@@ -1,21 +1,24 @@
-"""Shapes at the sizes of training, kept on disk: no picture is decoded twice, and all processes map the same pages.
+"""Shapes at the sizes of training, kept on disk: pictures are decoded once, and all processes map the same files.
 
-    TREE/.prepared/96x128-maps28-decimate-v1/<synset>/<model>.safetensors
+    TREE/.prepared/96x128-maps28-decimate-v2/<synset>/<model>.safetensors
 
-Each file holds one shape and says which files it was made from (their names, sizes and times) and the checksum of what
-it holds; one that no longer fits them, or is damaged, is made again. A tree that cannot be written to has its files in
-the user's cache folder, and the environment variable DIFFPOINT_PREPARED names a folder for all trees. They can be
-deleted at any time.
+A file holds the tensors of one shape and, in its header, from which files it was made (their names, sizes and times),
+its own time, and a checksum. When it is opened, its size, its time and the files that it was made from are compared;
+one that does not fit is made again. The checksum, which needs every byte, is left to `python -m train data check`:
+tensors are mapped, and read from the disk when a batch needs them.
+
+A tree that cannot be written to has its files in the user's cache folder, and the environment variable
+DIFFPOINT_PREPARED names a folder for all trees. The files can be deleted at any time.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import multiprocessing
 import os
 import sys
 import tempfile
+import time
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,49 +26,52 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 from tqdm import tqdm
 
+from diffpoint.camera import PinholeCamera
+from train.data.axis_frames import Frame
 from train.data.categories import category_of
-from train.data.frames import Frame
-from train.data.shrink import Sizes, SmallShape, shrink
-from train.data.tree import ShapeError, frame_of, layout_of, read_shape
-from train.data.work import run_all
+from train.data.shape import Shape, ShapeError
+from train.data.shrink import Sizes, shrink
+from train.data.tree import frame_of, layout_of, read_shape
 from train.errors import UserError
 from train.files import replacing
+from train.processes import map_unordered, progress_bar
 
-_VERSION = 1  # of the files, and of how shapes are shrunk
+_VERSION = 2  # of the files, and of how shapes are shrunk
 _TENSORS = ("images", "depth", "K", "cam_from_world", "points")
 _PLACE = "DIFFPOINT_PREPARED"
-_SHAPES_WORTH_A_PROCESS = 100  # it takes seconds to start
+_SHAPES_PER_PROCESS = 100  # starting one takes seconds
 
 
 def prepare(
-    root: Path, shapes: Sequence[str], sizes: Sizes, *, name: str = "shapes", progress: bool = True
-) -> dict[str, SmallShape | ShapeError]:
+    root: str | Path, shapes: Sequence[str], sizes: Sizes, *, name: str = "shapes", progress: bool = True
+) -> dict[str, Shape | ShapeError]:
     """The shapes of a tree, shrunk: from their prepared files, which are made where they are missing.
 
-    A process that is killed while it makes them has lost the shapes it was working on, no others; several that start
-    together wait for the one that makes them.
+    A process that is killed while it makes them loses only the shapes on which it was working; of several that start
+    together one makes them and the others wait.
 
     Args:
         root: of the data tree.
         shapes: "synset/model".
         sizes: what they are shrunk to.
-        name: what the bars call the shapes.
-        progress: show bars.
+        name: what the progress bars call the shapes.
+        progress: show progress bars.
 
     Returns:
-        In the order of `shapes`: tensors that are mapped from the files, or why a shape cannot be had.
+        In the order of `shapes`: shapes as `shrink` returns them, with tensors that are mapped from the files, or why
+        a shape cannot be read.
 
     Raises:
         UserError: `sizes` do not fit the renders.
     """
-    tree = _Tree(root, sizes, _name(frame_of(root)))
-    places = _places(root, sizes)
+    root = Path(root)
+    tree = _Tree(root, sizes, _frame_name(frame_of(root)))
+    places = [folder / _settings(sizes) for folder in _folders(root)]
     found = _look_up(places, tree, shapes, name=name, progress=progress)
     missing = [shape for shape in shapes if shape not in found]
     if missing:
@@ -80,15 +86,30 @@ def prepare(
     return {shape: found[shape] for shape in shapes}
 
 
+def damaged_files(root: str | Path) -> list[Path]:
+    """The prepared files of a tree, of all sizes, whose content does not fit their checksum. Reads all of them."""
+    damaged = []
+    for folder in _folders(Path(root)):
+        for path in sorted(folder.glob(f"*-v{_VERSION}/*/*.safetensors")):
+            try:
+                about, tensors = _load(path)
+            except (SafetensorError, OSError):
+                damaged.append(path)
+            else:
+                if about.get("checksum") != _checksum(tensors):
+                    damaged.append(path)
+    return damaged
+
+
 class _Tree(NamedTuple):
-    """A data tree, and what decides what is made of its files."""
+    """A data tree, and all that decides what is made of its files."""
 
     root: Path
     sizes: Sizes
     frame: str
 
     def source(self, shape: str) -> str:
-        """Changes when a file of the shape changes, appears or goes, or when the tree is turned another way."""
+        """A hash that changes when a file of the shape changes, appears or goes, or when the tree is turned anew."""
         layout = layout_of(self.root)
         cloud = layout.cloud_file(shape)
         try:
@@ -96,15 +117,15 @@ class _Tree(NamedTuple):
                 lines = sorted(_line(entry.name, entry.stat()) for entry in entries)
             lines.append(_line(cloud.name, cloud.stat()))
         except OSError as error:
-            lines = [str(error)]  # reading the shape will say more
+            lines = [str(error)]  # reading the shape fails with a better message
         return hashlib.sha256("\n".join([self.frame, *lines]).encode()).hexdigest()[:32]
 
-    def read(self, shape: str) -> SmallShape:
-        """From its pictures."""
+    def read(self, shape: str) -> Shape:
+        """The shape from its pictures, shrunk."""
         return shrink(read_shape(self.root, shape), self.sizes)
 
 
-def _name(frame: Frame) -> str:
+def _frame_name(frame: Frame) -> str:
     turns = (frame.turn_cloud, frame.turn_world, frame.turn_camera)
     return " ".join(repr(np.asarray(turn, float).tolist()) for turn in turns)
 
@@ -113,16 +134,19 @@ def _line(name: str, stat: os.stat_result) -> str:
     return f"{name} {stat.st_size} {stat.st_mtime_ns}"
 
 
-def _places(root: Path, sizes: Sizes) -> list[Path]:
-    """Folders where the shapes may be, the best first."""
-    height, width = sizes.image_size
-    settings = f"{height}x{width}-maps{sizes.map_size}-{sizes.pool}-v{_VERSION}"
+def _folders(root: Path) -> list[Path]:
+    """Folders where prepared files of a tree may be, the best first."""
     whole = root.resolve()
     tree = f"{whole.name}-{hashlib.sha256(str(whole).encode()).hexdigest()[:8]}"
     if chosen := os.environ.get(_PLACE):
-        return [Path(chosen) / tree / settings]
+        return [Path(chosen) / tree]
     caches = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
-    return [root / ".prepared" / settings, caches / "diffpoint" / "prepared" / tree / settings]
+    return [root / ".prepared", caches / "diffpoint" / "prepared" / tree]
+
+
+def _settings(sizes: Sizes) -> str:
+    height, width = sizes.image_size
+    return f"{height}x{width}-maps{sizes.map_size}-{sizes.pool}-v{_VERSION}"
 
 
 def _first_writable(places: Sequence[Path], root: Path) -> Path | None:
@@ -136,15 +160,15 @@ def _first_writable(places: Sequence[Path], root: Path) -> Path | None:
             reason = f"{error.strerror}: {place}"
             continue
         if number:
-            _say(f"{root} cannot be written to; its prepared shapes are kept in {place}")
+            _print(f"{root} cannot be written to; its prepared shapes are kept in {place}")
         return place
-    _say(f"no place to keep prepared shapes ({reason}): they are read anew each time; see {_PLACE}")
+    _print(f"no folder for prepared shapes can be written to ({reason}): they are read anew; see {_PLACE}")
     return None
 
 
 @contextlib.contextmanager
 def _one_at_a_time(place: Path) -> Iterator[None]:
-    """Waits for other processes that make files in `place`. A file system without locks only costs their work twice."""
+    """Waits for other processes that make files in `place`. Without file locks, the same work may be done twice."""
     try:
         import fcntl
     except ImportError:  # not on Windows
@@ -154,7 +178,7 @@ def _one_at_a_time(place: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            _say(f"another process prepares the shapes in {place}; waiting for it")
+            _print(f"another process prepares the shapes in {place}; waiting for it")
             fcntl.flock(lock, fcntl.LOCK_EX)
         except OSError:
             pass
@@ -163,11 +187,11 @@ def _one_at_a_time(place: Path) -> Iterator[None]:
 
 def _look_up(
     places: Sequence[Path], tree: _Tree, shapes: Sequence[str], *, name: str, progress: bool
-) -> dict[str, SmallShape | ShapeError]:
-    """What is there already; files that cannot be used are counted and said."""
-    found: dict[str, SmallShape | ShapeError] = {}
+) -> dict[str, Shape | ShapeError]:
+    """The shapes whose files are there and fit; prints how many files do not fit."""
+    found: dict[str, Shape | ShapeError] = {}
     unusable: Counter[str] = Counter()
-    for shape in tqdm(shapes, desc=f"opening {name}", unit="shape", leave=False, disable=not progress):
+    for shape in progress_bar(shapes, title=f"opening {name}", unit="shape", progress=progress, leave=False):
         small, reason = _find(places, tree, shape)
         if small is not None:
             found[shape] = small
@@ -175,37 +199,49 @@ def _look_up(
             unusable[reason] += 1
     for reason, count in sorted(unusable.items()):
         what = "shape is" if count == 1 else "shapes are"
-        _say(f"{tree.root}: {count} prepared {what} {reason}; made again")
+        _print(f"{tree.root}: {count} prepared {what} {reason}; made again")
     return found
 
 
-def _find(places: Sequence[Path], tree: _Tree, shape: str) -> tuple[SmallShape | None, str]:
-    """A prepared shape, from the first place that has it; else what is the matter with its file, if there is one."""
+def _find(places: Sequence[Path], tree: _Tree, shape: str) -> tuple[Shape | None, str]:
+    """A prepared shape from the first place that has a file that fits; else what is wrong with the file, if any."""
     source, reason = tree.source(shape), ""
     for place in places:
         result = _open(place, shape, source)
-        if isinstance(result, SmallShape):
+        if isinstance(result, Shape):
             return result, ""
         reason = reason or result
     return None, reason
 
 
-def _open(place: Path, shape: str, source: str) -> SmallShape | str:
-    """A prepared shape, or what is the matter with its file; nothing if there is none."""
+def _open(place: Path, shape: str, source: str) -> Shape | str:
+    """A prepared shape, or what is wrong with its file: "" if there is none."""
+    path = _file(place, shape)
     try:
-        with safe_open(_file(place, shape), "pt") as file:
-            about = file.metadata() or {}
-            if about.get("source") != source:
-                return "outdated"
-            # Mapped, not read: pages come when they are touched and are the system's to take back.
-            tensors = {name: file.get_tensor(name) for name in _TENSORS}
+        about, tensors = _load(path)
+        changed = about.get("time") != str(path.stat().st_mtime_ns)
     except (FileNotFoundError, NotADirectoryError):
         return ""
     except (SafetensorError, OSError):
         return "damaged"
-    if about.get("checksum") != _checksum(tensors):
+    if about.get("source") != source:
+        return "outdated"
+    if changed:
         return "damaged"
-    return SmallShape(shape, category_of(shape.split("/")[0]), **tensors)
+    size = tensors["depth"].shape[-1]
+    camera = PinholeCamera(tensors["K"], tensors["cam_from_world"], size, size)
+    category = category_of(shape.split("/")[0])
+    return Shape(tensors["images"], tensors["depth"], camera, tensors["points"], shape, category)
+
+
+def _load(path: Path) -> tuple[Mapping[str, str], dict[str, Tensor]]:
+    """The header of a file and its tensors: mapped, so that their pages are read when they are used.
+
+    Raises:
+        SafetensorError: no safetensors file, or its length is not what its header says.
+    """
+    with safe_open(path, "pt") as file:
+        return file.metadata() or {}, {name: file.get_tensor(name) for name in _TENSORS}
 
 
 def _file(place: Path, shape: str) -> Path:
@@ -213,7 +249,6 @@ def _file(place: Path, shape: str) -> Path:
 
 
 def _checksum(tensors: Mapping[str, Tensor]) -> str:
-    """A crash of the machine can leave zeros in a file whose name is already there."""
     value = 0
     for name in _TENSORS:
         value = zlib.crc32(tensors[name].numpy().data, value)
@@ -228,15 +263,20 @@ class _Job(NamedTuple):
 
 def _make(
     place: Path, tree: _Tree, shapes: Sequence[str], *, name: str, progress: bool
-) -> dict[str, SmallShape | ShapeError]:
-    """Makes the files of `shapes`, those for which there is room, and maps them."""
+) -> dict[str, Shape | ShapeError]:
+    """Makes the files of `shapes`, as many as there is room for, and maps them."""
     for leftover in place.glob("*/.*.tmp"):  # of a process that was killed
         leftover.unlink(missing_ok=True)
     jobs = [_Job(place, tree, shape) for shape in shapes]
-    processes = max(1, min(os.cpu_count() or 1, len(jobs) // _SHAPES_WORTH_A_PROCESS))
-    made: dict[str, SmallShape | ShapeError] = {}
-    results = run_all(
-        _make_one, jobs, processes=processes, desc=f"preparing {name}", unit="shape", progress=progress
+    made: dict[str, Shape | ShapeError] = {}
+    results = map_unordered(
+        _make_one,
+        jobs,
+        processes=None,
+        title=f"preparing {name}",
+        unit="shape",
+        progress=progress,
+        jobs_per_process=_SHAPES_PER_PROCESS,
     )
     with contextlib.closing(results):
         for job, result in results:
@@ -244,13 +284,13 @@ def _make(
                 made[job.shape] = result
             elif isinstance(result, UserError):
                 raise UserError(f"{tree.root}: {result}")
-            elif isinstance(result, OSError):  # its process died
+            elif isinstance(result, OSError):  # its process crashed
                 made[job.shape] = ShapeError(f"{job.shape}: {result}")
             elif isinstance(result, _NoRoom):
-                _say(f"prepared shapes cannot be kept in {place} ({result.reason}); see {_PLACE}")
+                _print(f"prepared shapes cannot be kept in {place} ({result.reason}); see {_PLACE}")
                 break
     for shape in shapes:
-        if shape not in made and isinstance(opened := _open(place, shape, tree.source(shape)), SmallShape):
+        if shape not in made and isinstance(opened := _open(place, shape, tree.source(shape)), Shape):
             made[shape] = opened
     return made
 
@@ -262,16 +302,24 @@ class _NoRoom(NamedTuple):
 
 
 def _make_one(job: _Job) -> UserError | _NoRoom | None:
-    """Makes one file; runs in a process of its own, which needs no more than one thread and no kernels."""
-    if multiprocessing.parent_process() is not None:
-        torch.set_num_threads(1)
+    """Makes one file, perhaps in a worker process."""
     try:
-        source = job.tree.source(job.shape)  # before reading: what changes while it is read must not pass
+        source = job.tree.source(
+            job.shape
+        )  # before reading, so that a change while it is read is noticed later
         small = job.tree.read(job.shape)
-        tensors = {name: getattr(small, name).contiguous() for name in _TENSORS}
-        about = {"source": source, "checksum": _checksum(tensors)}
+        K, cam_from_world = small.camera.K, small.camera.cam_from_world
+        values = (small.images, small.depth, K, cam_from_world, small.points)
+        tensors = {name: value.contiguous() for name, value in zip(_TENSORS, values, strict=True)}
+        # The file gets this time, in whole seconds, which every file system and copy keeps: a later change shows.
+        written = int(time.time()) * 10**9
+        about = {"source": source, "time": str(written), "checksum": _checksum(tensors)}
         with replacing(_file(job.place, job.shape)) as temporary:
-            temporary.write_bytes(save(tensors, metadata=about))
+            with temporary.open("wb") as file:
+                file.write(save(tensors, metadata=about))
+                file.flush()
+                os.fsync(file.fileno())  # else a crash of the machine can leave zeros under the final name
+            os.utime(temporary, ns=(written, written))
     except UserError as error:
         return error
     except OSError as error:
@@ -279,12 +327,11 @@ def _make_one(job: _Job) -> UserError | _NoRoom | None:
     return None
 
 
-def _read(
-    tree: _Tree, shapes: Sequence[str], *, name: str, progress: bool
-) -> dict[str, SmallShape | ShapeError]:
-    """Shapes whose files could not be kept, in memory."""
-    read: dict[str, SmallShape | ShapeError] = {}
-    for shape in tqdm(shapes, desc=f"reading {name}", unit="shape", disable=not (progress and shapes)):
+def _read(tree: _Tree, shapes: Sequence[str], *, name: str, progress: bool) -> dict[str, Shape | ShapeError]:
+    """Shapes whose files could not be kept, read into memory."""
+    read: dict[str, Shape | ShapeError] = {}
+    bar = progress_bar(shapes, title=f"reading {name}", unit="shape", progress=progress and len(shapes) > 0)
+    for shape in bar:
         try:
             read[shape] = tree.read(shape)
         except ShapeError as error:
@@ -294,5 +341,5 @@ def _read(
     return read
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     tqdm.write(text, file=sys.stderr)

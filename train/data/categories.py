@@ -24,7 +24,7 @@ UNKNOWN = "unknown"
 
 
 def synset_of(category: str) -> str:
-    """The folder name of a category: its synset, or for a category of the user's own its name, made safe."""
+    """The folder name of a category: its synset, or for other categories their name in safe characters."""
     return SYNSET_OF.get(category) or re.sub(r"[^A-Za-z0-9-]+", "_", category).strip("_") or UNKNOWN
 
 

@@ -1,4 +1,4 @@
-"""Is a dataset whole, and do its pictures, cameras, depth maps and clouds speak of the same objects?"""
+"""Is a data tree complete, and are its pictures, cameras, depth maps and clouds consistent?"""
 
 from __future__ import annotations
 
@@ -11,63 +11,68 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from train.data import store
-from train.data.agreement import Agreement, agreement
+from train.data import tree_files
+from train.data.axis_frames import AS_IT_IS, Frame, find_frame
+from train.data.cache import damaged_files
 from train.data.categories import category_of
-from train.data.frames import AS_IT_IS, Frame, find_frame, is_own
+from train.data.consistency import Consistency, measure_consistency
 from train.data.tree import Shape, ShapeError, ShapeTree, frame_of, layout_of, read_shape, sample_shapes
-from train.data.work import run_all
-
-__all__ = ["Agreement", "TreeReport", "agreement", "check_tree"]
+from train.processes import map_unordered
 
 _INK = 0.85
 """A pixel darker than this in a channel is drawn on; white is the background."""
 _MOST_OUTSIDE = 0.25
 _MOST_FILLED = 0.995
-_WORTH_PROCESSES = 200
-"""Shapes from which on reading them takes longer than starting processes."""
+_SHAPES_PER_PROCESS = 100
 
 
 @dataclasses.dataclass(frozen=True)
 class TreeReport:
-    """What `check_tree` found."""
+    """What `check_tree` found.
+
+    Attributes:
+        path: root of the tree.
+        counts: readable shapes by split.
+        categories: and by category.
+        consistencies: of the readable shapes.
+        problems: a line for each.
+        frame: the axis conventions of clouds and cameras.
+        has_depth: False for renderings without depth maps.
+    """
 
     path: Path
     counts: dict[str, int]
     categories: dict[str, int]
-    agreements: tuple[Agreement, ...]
+    consistencies: tuple[Consistency, ...]
     problems: list[str]
     frame: Frame
     has_depth: bool = True
 
     @property
     def inside(self) -> float:
-        """Mean over the shapes that can be read."""
-        return float(np.mean([each.inside for each in self.agreements])) if self.agreements else float("nan")
+        """Mean over the readable shapes; NaN if there is none."""
+        return float(np.mean([each.inside for each in self.consistencies] or [np.nan]))
 
     @property
     def residual(self) -> float:
-        """Median over the shapes that can be read."""
-        return (
-            float(np.median([each.residual for each in self.agreements])) if self.agreements else float("nan")
-        )
+        """Median over the readable shapes; NaN if there is none."""
+        return float(np.median([each.residual for each in self.consistencies] or [np.nan]))
 
     def summary(self) -> str:
         """Lines for the terminal."""
         splits = ", ".join(f"{count} {split}" for split, count in self.counts.items())
         kinds = ", ".join(f"{count} {name}" for name, count in self.categories.items())
-        agree = sum(each.holds for each in self.agreements)
-        fit = f"{self.inside:.2%} of the points project into the silhouette"
+        consistent = sum(each.holds for each in self.consistencies)
+        files, fit = (
+            "cameras, silhouettes and clouds",
+            f"{self.inside:.2%} of the points project into the silhouette",
+        )
         if self.has_depth:
-            files, fit = (
-                "cameras, depth and clouds",
-                f"{fit}, visible ones are {self.residual:.4f} from the depth map",
-            )
-        else:
-            files = "cameras, silhouettes and clouds"
+            files = "cameras, depth and clouds"
+            fit += f", visible ones are {self.residual:.4f} from the depth map"
         lines = [
-            f"{self.path}: {len(self.agreements)} shapes can be read ({splits}): {kinds}",
-            f"{files} agree in {agree} of them: {fit}",
+            f"{self.path}: {len(self.consistencies)} shapes can be read ({splits}): {kinds}",
+            f"{files} agree in {consistent} of them: {fit}",
             f"frames: {self.frame.verdict}",
         ]
         if not self.has_depth:
@@ -86,10 +91,10 @@ class _Job(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Looked:
-    """What one shape looks like by itself; how many views, how large, how many points is compared with the others."""
+class _Checked:
+    """A readable shape: what is wrong with it, and what must be the same for all shapes of a tree."""
 
-    agreement: Agreement
+    consistency: Consistency
     views: int
     size: tuple[int, int]
     points: int
@@ -98,7 +103,9 @@ class _Looked:
 
 
 def check_tree(path: str | Path, *, processes: int | None = None) -> TreeReport:
-    """Read every shape of every split; name what is missing, broken, listed twice or does not agree.
+    """Reads every shape of every split; names what is missing, broken, listed twice or inconsistent.
+
+    The files that training has prepared of the tree are compared with their checksums.
 
     Args:
         path: root of a data tree.
@@ -108,7 +115,7 @@ def check_tree(path: str | Path, *, processes: int | None = None) -> TreeReport:
         UserError: no dataset at `path`.
     """
     root = Path(path)
-    trees = {split: ShapeTree(root, split) for split in store.SPLITS}
+    trees = {split: ShapeTree(root, split) for split in tree_files.SPLITS}
     problems = [reason for tree in trees.values() for reason in tree.skipped.values()]
     listed = Counter(shape for tree in trees.values() for shape in (*tree.ids, *tree.skipped))
     problems += [f"{shape}: listed {count} times" for shape, count in listed.items() if count > 1]
@@ -121,52 +128,59 @@ def check_tree(path: str | Path, *, processes: int | None = None) -> TreeReport:
     jobs = [
         _Job(root, shape) for shape in dict.fromkeys(shape for tree in trees.values() for shape in tree.ids)
     ]
-    if processes is None and len(jobs) < _WORTH_PROCESSES:
-        processes = 1
-    looked: dict[str, _Looked] = {}
-    for job, result in run_all(_look, jobs, processes=processes, desc="checking", unit="shape"):
-        if isinstance(result, _Looked):
-            looked[job.shape] = result
+    checked: dict[str, _Checked] = {}
+    for job, result in map_unordered(
+        _check_one,
+        jobs,
+        processes=processes,
+        title="checking",
+        unit="shape",
+        jobs_per_process=_SHAPES_PER_PROCESS,
+    ):
+        if isinstance(result, _Checked):
+            checked[job.shape] = result
         else:
             problems.append(str(result) if isinstance(result, ShapeError) else f"{job.shape}: {result}")
-    looked = {job.shape: looked[job.shape] for job in jobs if job.shape in looked}
-    apart = [shape for shape, each in looked.items() if not each.agreement.holds]
-    if is_own(root) and 2 * len(apart) > len(looked):
-        frame = _whose_frame(root, apart)
-    if not frame.settled and looked:
+    checked = {job.shape: checked[job.shape] for job in jobs if job.shape in checked}
+    inconsistent = [shape for shape, each in checked.items() if not each.consistency.holds]
+    if tree_files.is_own(root) and 2 * len(inconsistent) > len(checked):
+        frame = _changed_frame(root, inconsistent)
+    if not frame.settled and checked:
         problems.append(f"{root}: {frame.verdict}")
-    for each in looked.values():
+    for each in checked.values():
         problems += each.problems
-    problems += _unusual(looked)
-    categories = Counter(category_of(shape.split("/")[0]) for shape in looked)
-    counts = {split: len(looked.keys() & set(tree.ids)) for split, tree in trees.items()}
+    problems += _unusual(checked)
+    problems += [
+        f"{damaged}: prepared for training, and damaged; delete it, training makes it again"
+        for damaged in damaged_files(root)
+    ]
     return TreeReport(
         root,
-        counts,
-        dict(categories),
-        tuple(each.agreement for each in looked.values()),
+        {split: len(checked.keys() & set(tree.ids)) for split, tree in trees.items()},
+        dict(Counter(category_of(shape.split("/")[0]) for shape in checked)),
+        tuple(each.consistency for each in checked.values()),
         problems,
         frame,
-        has_depth=all(each.has_depth for each in looked.values()),
+        has_depth=all(each.has_depth for each in checked.values()),
     )
 
 
-def _look(job: _Job) -> _Looked | ShapeError:
+def _check_one(job: _Job) -> _Checked | ShapeError:
     try:
         shape = read_shape(job.root, job.shape)
     except ShapeError as error:
         return error
-    found = agreement(shape)
-    problems = [f"{shape.id}: {problem}" for problem in _blemishes(shape)]
+    found = measure_consistency(shape)
+    problems = [f"{shape.id}: {problem}" for problem in _bad_views(shape)]
     if not found.holds:
         what = "depth and cloud" if shape.has_depth else "silhouettes and cloud"
         problems.append(f"{shape.id}: cameras, {what} do not agree ({found})")
     size = (shape.depth.shape[1], shape.depth.shape[2])
-    return _Looked(found, len(shape.depth), size, len(shape.points), shape.has_depth, tuple(problems))
+    return _Checked(found, len(shape.depth), size, len(shape.points), shape.has_depth, tuple(problems))
 
 
-def _blemishes(shape: Shape) -> Iterable[str]:
-    """Views that show nothing, views without background, pictures of something else than the depth map."""
+def _bad_views(shape: Shape) -> Iterable[str]:
+    """Views that show nothing, views without background, pictures that do not fit their depth map."""
     for view, (image, depth) in enumerate(zip(shape.images.numpy(), shape.depth.numpy(), strict=True)):
         seen = np.less(depth, np.inf) | np.isnan(depth)
         if not seen.any():
@@ -181,30 +195,32 @@ def _blemishes(shape: Shape) -> Iterable[str]:
                 yield f"view {view}: {outside:.0%} of what the picture shows is outside the mask of the depth map"
 
 
-def _unusual(looked: dict[str, _Looked]) -> list[str]:
+def _unusual(checked: dict[str, _Checked]) -> list[str]:
     """Shapes that differ from most of the tree in what must be the same for all."""
     problems = []
     for name, unit in (("views", "views"), ("size", "pixels"), ("points", "points")):
-        values = {shape: getattr(each, name) for shape, each in looked.items()}
+        values = {shape: getattr(each, name) for shape, each in checked.items()}
         usual = Counter(values.values()).most_common(1)[0][0] if values else None
         problems += [
-            f"{shape}: {_said(value)} {unit}, elsewhere {_said(usual)}"
+            f"{shape}: {_text(value)} {unit}, elsewhere {_text(usual)}"
             for shape, value in values.items()
             if value != usual
         ]
     return problems
 
 
-def _said(value) -> str:
+def _text(value) -> str:
     return " x ".join(map(str, value[::-1])) if isinstance(value, tuple) else str(value)
 
 
-def _whose_frame(root: Path, shapes: list[str]) -> Frame:
-    """The verdict on a tree that this program made and in which most shapes do not agree: somebody changed it."""
+def _changed_frame(root: Path, shapes: list[str]) -> Frame:
+    """The frame of a tree that this program made and in which most shapes are inconsistent: somebody changed it."""
     found = find_frame(sample_shapes(layout_of(root), shapes))
     if not found.settled or not found.changes:
         return dataclasses.replace(AS_IT_IS, verdict=found.verdict, settled=found.settled)
-    said = found.verdict.split(":")[0]
+    conventions = found.verdict.split(":")[0]
     return dataclasses.replace(
-        AS_IT_IS, verdict=f"{said}; not as this program wrote them: make the data again", settled=False
+        AS_IT_IS,
+        verdict=f"{conventions}; not as this program wrote them: make the data again",
+        settled=False,
     )

@@ -1,4 +1,4 @@
-"""Contact sheets of a dataset: for each category a picture with a strip for each shape, to be looked at."""
+"""Contact sheets of a data tree: for each category one picture with a strip of views for each shape."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import torch
 from matplotlib import colormaps
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
-from tqdm import tqdm
 
 from diffpoint import PinholeCamera, project
-from train.data import store
+from train.data import tree_files
 from train.data.categories import category_of, synset_of
 from train.data.tree import Shape, ShapeError, ShapeTree, read_shape
 from train.errors import UserError
 from train.files import replacing
+from train.processes import progress_bar
 from train.show.figures import TRUE, close_up, from_behind
 
 _CELL = 144
@@ -26,18 +26,22 @@ _VIEWS = 4
 _COLUMNS = _VIEWS + 3
 _TITLE = 18  # pixels of the line above a strip
 _RULE = 16  # pixels between strips that stand side by side
-_TALLEST = 16  # strips above each other, before there are two columns of them
-_FINER = 3  # clouds are drawn so many times larger, and shrunk
+_TALLEST = 16  # strips in a column before there are two columns
+_FINER = 3  # clouds are drawn this many times larger, then reduced
 _RADIUS = 1.2  # pixels
 _INK = (90, 100, 112)
 
 
 def show(
-    data: Path, out: Path | None = None, *, categories: Sequence[str] | None = None, shapes: int = 8
+    data: str | Path,
+    out: str | Path | None = None,
+    *,
+    categories: Sequence[str] | None = None,
+    shapes: int = 8,
 ) -> dict[str, Path]:
-    """Write a contact sheet for each category, named after it: views, depth, the cloud from that view and from behind.
+    """Writes a contact sheet for each category: views, depth, the cloud from that view and from behind.
 
-    Every strip is titled with its shape's name and split, so that what is wrong can be found.
+    Every strip is titled with its shape's name and split.
 
     Args:
         data: root of a data tree.
@@ -53,9 +57,10 @@ def show(
     """
     if shapes < 1:
         raise UserError(f"shapes must be at least 1; got {shapes}")
+    out = Path(data) / "contact" if out is None else Path(out)
     ids: dict[str, list[str]] = defaultdict(list)
     split_of: dict[str, str] = {}
-    for split in store.SPLITS:
+    for split in tree_files.SPLITS:
         for shape in ShapeTree(data, split).ids:
             ids[shape.split("/")[0]].append(shape)
             split_of[shape] = split
@@ -69,7 +74,7 @@ def show(
         found = sorted(ids[synset])
         strips = []
         chosen = np.linspace(0, len(found) - 1, min(shapes, len(found))).astype(int)
-        for number in tqdm(chosen, desc=f"drawing {category_of(synset)}", unit="shape", leave=False):
+        for number in progress_bar(chosen, title=f"drawing {category_of(synset)}", unit="shape", leave=False):
             try:
                 strips.append(strip_of(read_shape(data, found[number]), split=split_of[found[number]]))
             except ShapeError:
@@ -78,8 +83,7 @@ def show(
             raise UserError(
                 f"{data}: no shape of {category_of(synset)} can be read; see: python -m train data check"
             )
-        path = (out or data / "contact") / f"{category_of(synset)}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path = out / f"{category_of(synset)}.png"
         with replacing(path) as temporary:
             Image.fromarray(_arranged(strips)).save(temporary, format="PNG", optimize=True)
         sheets[category_of(synset)] = path
@@ -111,7 +115,7 @@ def _title(text: str) -> np.ndarray:
 
 
 def _arranged(strips: Sequence[np.ndarray]) -> np.ndarray:
-    """Strips above each other, in so many columns that the sheet does not become a ribbon."""
+    """Strips below each other, in as many columns as keep the sheet about as wide as high."""
     columns = 1
     while -(-len(strips) // columns) > _TALLEST * columns:
         columns += 1

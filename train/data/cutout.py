@@ -29,8 +29,8 @@ class CutOut:
     Attributes:
         picture: (S, S, 3) uint8, on white.
         mask: (H, W) bool, as large as the photograph.
-        way: "mask", "alpha" or "plain background".
-        found: what was found, in words.
+        way: how the object was found: "mask", "alpha" or "plain background".
+        found: a description of what was found.
     """
 
     picture: np.ndarray
@@ -40,16 +40,16 @@ class CutOut:
 
 
 def cut_out(rgba: np.ndarray, *, size: int = 224, given: np.ndarray | None = None) -> CutOut:
-    """Cut the object out of a photograph.
+    """Cuts the object out of a photograph.
 
     Args:
         rgba: (H, W, 4) in [0, 1].
         size: side of the picture that is made.
-        given: (H, W, 4) in [0, 1], a mask; its alpha channel counts if it has holes, else its brightness. Without one,
-            the photograph's own alpha counts, and if that has no holes the background has to be plain.
+        given: (H, W, 4) in [0, 1], a mask: its alpha channel if that is transparent anywhere, else its brightness.
+            Without one, the photograph's own alpha is used, and if that is opaque the background has to be plain.
 
     Raises:
-        UserError: a mask that does not fit, nothing to be seen, or a background that is not plain.
+        UserError: a mask of another size, an empty mask, or a background that is not plain.
     """
     height, width = rgba.shape[:2]
     colours = rgba[..., :3]

@@ -1,9 +1,9 @@
-"""The object in a photograph with a plain background: where is it, and is the background plain at all?
+"""Finding the object in a photograph with a plain background, and whether the background is plain.
 
 The background is a colour times light that changes slowly over the picture; it is fitted to the border and then to all
 that resembles it. A cast shadow is the same colour with less light and soft edges, an object has sharp ones, however
 faint: from the border, background spreads over everything that has the background's hue and is not separated from it by
-a sharp edge. Where a grey part meets its own shadow at one tone, nothing tells them apart.
+a sharp edge. A grey part that touches its own shadow of the same tone cannot be told from it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 WORKING_SIDE = 640
-"""Photographs are made smaller before; what a sharp edge is, is said in these pixels."""
+"""Photographs are reduced to this side first; widths of edges below are in these pixels."""
 
 _BAND = 0.03  # width of the border, share of the shorter side
 _FAR = 0.06  # a border pixel further from the fit is not background
@@ -55,7 +55,7 @@ class Foreground:
 
 
 def find_foreground(pixels: np.ndarray) -> Foreground:
-    """Separate an object from a plain background.
+    """Separates an object from a plain background.
 
     Args:
         pixels: (H, W, 3) in [0, 1], the longer side about `WORKING_SIDE`.
@@ -225,7 +225,7 @@ def _touched(mask: np.ndarray) -> tuple[str, ...]:
     return tuple(name for name, strip in sides.items() if strip.any())
 
 
-# scipy's operations under one convention: (H, W) bool in and out, square windows, nothing known beyond the picture.
+# scipy's operations with one convention: (H, W) bool in and out, square windows, borders as scipy's defaults.
 
 
 def _mean3(values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Pictures from anywhere -> what the network expects: RGB on white, square, in [0, 1]."""
+"""Decoding pictures, and pictures from anywhere as the network expects them: RGB on white, square, in [0, 1]."""
 
 from __future__ import annotations
 
@@ -18,7 +18,34 @@ _WHITE = 0.985
 _BLANK = 0.97
 
 
-def read_images(paths: Sequence[Path], *, size: int = 224) -> Tensor:
+def decode(path: str | Path) -> np.ndarray:
+    """The pixels of a picture file, upright: (H, W, 1 to 4), grey or colour with or without alpha.
+
+    Integers of 8 or 16 bits, or floats in [0, 1]; palettes and other colour models become RGBA of 8 bits.
+
+    Raises:
+        OSError, ValueError, or another exception of the format's decoder: the file is missing or broken.
+    """
+    with Image.open(path) as file:
+        image = ImageOps.exif_transpose(file)  # cameras note how they were held instead of turning the pixels
+        if image.mode.startswith("I"):  # 16 bits of grey; older versions of Pillow widen them to 32
+            return np.asarray(image).clip(0, 65535).astype(np.uint16)[..., None]
+        if image.mode not in ("L", "LA", "RGB", "RGBA", "F"):
+            image = image.convert("RGBA")
+        return np.atleast_3d(np.asarray(image))
+
+
+def on_white(pixels: np.ndarray) -> Tensor:
+    """Decoded pixels (H, W, 1 to 4) as RGB (3, H, W) in [0, 1], where transparency shows white."""
+    values = _scaled(pixels)
+    if values.shape[2] in (2, 4):
+        alpha = values[..., -1:]
+        values = values[..., :-1] * alpha + (1 - alpha)
+    values = np.broadcast_to(values, (*values.shape[:2], 3)) if values.shape[2] == 1 else values
+    return torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))
+
+
+def read_images(paths: Sequence[str | Path], *, size: int = 224) -> Tensor:
     """Reads pictures of one object, composites transparency on white and pads each to a centred square.
 
     Args:
@@ -40,35 +67,43 @@ def read_images(paths: Sequence[Path], *, size: int = 224) -> Tensor:
     )
 
 
-def _read(path: Path) -> Tensor:
-    """(3, H, W) in [0, 1] on white."""
-    picture = on_white(_decode(path))
-    if picture.min() > _BLANK:
-        raise UserError(f"{path} shows nothing: it is white or transparent everywhere")
-    return picture
-
-
-def read_rgba(path: Path) -> np.ndarray:
-    """(H, W, 4) float32 in [0, 1], upright; alpha is 1 everywhere if the file has none.
+def read_rgba(path: str | Path) -> np.ndarray:
+    """Reads a picture as (H, W, 4) float32 in [0, 1], upright; alpha is 1 everywhere if the file has none.
 
     Raises:
         UserError: the file is missing, is no image, or is too small to show an object.
     """
-    values = _scaled(_decode(path))
+    values = _scaled(_decode_object(path))
     colours = values[..., :3] if values.shape[2] > 2 else values[..., :1]
     alpha = values[..., -1:] if values.shape[2] in (2, 4) else np.ones_like(values[..., :1])
     return np.concatenate((np.broadcast_to(colours, (*values.shape[:2], 3)), alpha), axis=2)
 
 
-def _decode(path: Path) -> np.ndarray:
-    """(H, W, channels) as decoded, upright."""
-    if not path.is_file():
+def is_cut_out(rgba: np.ndarray) -> bool:
+    """True for a picture (H, W, 4) that shows an object alone: it has transparency, or three of its sides are white.
+
+    The fourth side may be covered by the object. White means the white of a file, not of photographed paper.
+    """
+    if (rgba[..., 3] < 0.5).any():
+        return True
+    sides = (rgba[0], rgba[-1], rgba[:, 0], rgba[:, -1])
+    return sum(float(np.quantile(side[:, :3].min(1), 0.1)) >= _WHITE for side in sides) >= 3
+
+
+def _read(path: str | Path) -> Tensor:
+    """(3, H, W) in [0, 1] on white."""
+    picture = on_white(_decode_object(path))
+    if picture.min() > _BLANK:
+        raise UserError(f"{path} shows nothing: it is white or transparent everywhere")
+    return picture
+
+
+def _decode_object(path: str | Path) -> np.ndarray:
+    """`decode`, with errors for the user."""
+    if not Path(path).is_file():
         raise UserError(f"{path} does not exist or is no file; name the images to reconstruct from")
     try:
-        with Image.open(path) as file:
-            # Cameras note how they were held instead of turning the pixels.
-            image = ImageOps.exif_transpose(file)
-            pixels = _pixels(image)
+        pixels = decode(path)
         if not np.isfinite(pixels).all():
             raise ValueError("some pixels are not finite")
     except Exception as error:  # every decoder has its own exceptions; all mean that this is no image
@@ -86,36 +121,6 @@ def _scaled(pixels: np.ndarray) -> np.ndarray:
     """As float32 in [0, 1]."""
     top = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1.0
     return np.asarray(pixels, np.float32) / np.float32(top)
-
-
-def _pixels(image: Image.Image) -> np.ndarray:
-    """(H, W, channels), grey or colour with or without alpha, in one of the types that `on_white` scales."""
-    if image.mode.startswith("I"):  # 16 bits of grey; older versions of Pillow widen them to 32
-        return np.asarray(image).clip(0, 65535).astype(np.uint16)[..., None]
-    if image.mode not in ("L", "LA", "RGB", "RGBA", "F"):
-        image = image.convert("RGBA")
-    return np.atleast_3d(np.asarray(image))
-
-
-def is_cut_out(rgba: np.ndarray) -> bool:
-    """True for a picture (H, W, 4) that shows an object alone: it has transparency, or three of its sides are white.
-
-    The fourth may be the object's. White is white paper in a file, not a photograph of it.
-    """
-    if (rgba[..., 3] < 0.5).any():
-        return True
-    sides = (rgba[0], rgba[-1], rgba[:, 0], rgba[:, -1])
-    return sum(float(np.quantile(side[:, :3].min(1), 0.1)) >= _WHITE for side in sides) >= 3
-
-
-def on_white(pixels: np.ndarray) -> Tensor:
-    """Decoded pixels (H, W, 1 to 4), grey or colour with or without alpha, as (3, H, W) in [0, 1]; holes are white."""
-    values = _scaled(pixels)
-    if values.shape[2] in (2, 4):
-        alpha = values[..., -1:]
-        values = values[..., :-1] * alpha + (1 - alpha)
-    values = np.broadcast_to(values, (*values.shape[:2], 3)) if values.shape[2] == 1 else values
-    return torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))
 
 
 def _square(image: Tensor) -> Tensor:

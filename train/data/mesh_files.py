@@ -28,17 +28,17 @@ class MeshError(Exception):
 
 
 def load_surface(
-    path: Path,
+    path: str | Path,
     rotation: Sequence[float] | None = None,
     *,
     scale: float | None = None,
-    root: Path | None = None,
+    root: str | Path | None = None,
 ) -> Surface:
-    """Load a mesh, turn it, and centre its bounding box on the origin.
+    """Loads a mesh, turns it, and centres its bounding box on the origin.
 
     Args:
         path: the file.
-        rotation: 9 numbers, row by row; None leaves it as it stands.
+        rotation: 9 numbers, row by row; None for none.
         scale: world units per unit of the file; None makes the diagonal of the bounding box 1, as ShapeNet does.
         root: folder below which its materials and textures may be; by default that above the file's, for ShapeNet's
             second version names textures `../images/...`.
@@ -47,10 +47,11 @@ def load_surface(
         MeshError: no faces, coordinates that are no numbers, no extent in one of the three directions (as one triangle
             has none), a file that cannot be read or is too large.
     """
+    path = Path(path)
     if path.stat().st_size > _LARGEST_FILE:
-        raise MeshError(f"larger than {_LARGEST_FILE >> 20} MB: make it coarser")
+        raise MeshError(f"larger than {_LARGEST_FILE >> 20} MB: reduce its number of faces")
     try:
-        files = _Files(path, root or path.parent.parent)
+        files = _Files(path, Path(root) if root else path.parent.parent)
         with path.open("rb") as file:
             scene = trimesh.load(
                 file, file_type=path.suffix[1:].lower(), resolver=files, force="scene", process=False
@@ -58,7 +59,7 @@ def load_surface(
         parts = _parts(scene)  # pyright: ignore[reportArgumentType]
     except MeshError:
         raise
-    except Exception as error:  # each format's reader has its own way to fail
+    except Exception as error:  # each format's reader has its own exceptions
         raise MeshError(f"cannot be read ({type(error).__name__}: {error})") from error
     if not parts:
         raise MeshError("no faces")
@@ -71,7 +72,7 @@ def load_surface(
     low, high = corners.min((0, 1)), corners.max((0, 1))
     diagonal = float(np.linalg.norm(high - low))
     if diagonal == 0 or not np.isfinite(diagonal):
-        raise MeshError("no extent: all its vertices are in one place")
+        raise MeshError("no extent: all its vertices are at one point")
     corners = (corners - (low + high) / 2) / diagonal
     sides = corners[:, 1:] - corners[:, :1]
     if np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() < 1e-9:
@@ -110,7 +111,7 @@ def _parts(scene: trimesh.Scene) -> list[Surface]:
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             continue
         if mesh.faces.max() >= len(mesh.vertices) or mesh.faces.min() < 0:
-            raise MeshError("faces that name vertices it does not have")
+            raise MeshError("faces with indices of vertices that it does not have")
         vertices = np.asarray(mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
         parts.append(_coloured(mesh, vertices, np.asarray(mesh.faces)))
     return parts
@@ -147,8 +148,8 @@ def _texture(image: Image.Image) -> np.ndarray:
     """RGB (h, w, 3) uint8, transparency on white."""
     image = image.convert("RGBA")
     image.thumbnail((_TEXTURE_SIZE, _TEXTURE_SIZE))
-    paper = Image.new("RGBA", image.size, "white")
-    return np.asarray(Image.alpha_composite(paper, image).convert("RGB"))
+    ground = Image.new("RGBA", image.size, "white")
+    return np.asarray(Image.alpha_composite(ground, image).convert("RGB"))
 
 
 def _joined(parts: Sequence[Surface]) -> Surface:

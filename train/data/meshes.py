@@ -1,4 +1,4 @@
-"""Meshes of any make to the dataset: load, stand upright in a unit box, render, sample."""
+"""Meshes of any format to a data tree: load, turn upright, scale to a unit box, render, sample."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from train.data import store
+from train.data import tree_files
 from train.data.categories import category_of
-from train.data.hidden import sample_seen
 from train.data.mesh_files import MeshError, load_surface
-from train.data.render import Orbit, Renderer, draw_camera
-from train.data.sources import (
+from train.data.mesh_sources import (
     UPRIGHT,
     MeshFile,
     find_meshes,
@@ -26,10 +24,12 @@ from train.data.sources import (
     read_labels,
     shape_ids,
 )
+from train.data.render import Orbit, Renderer, draw_camera
 from train.data.surface import sample_triangles
-from train.data.work import run_all
+from train.data.visible_samples import sample_visible
 from train.errors import UserError
 from train.files import write_text
+from train.processes import map_unordered
 
 LEFT_OUT = "left_out.csv"
 """In the dataset's folder: the meshes that the last run could not use, and why."""
@@ -39,14 +39,14 @@ _NAMED = 20  # as many are named on the terminal
 
 @dataclasses.dataclass(frozen=True)
 class MeshOptions:
-    """How meshes become shapes; all of it is the same throughout a dataset, but for the category.
+    """How meshes become shapes. All but the category must be the same throughout a dataset.
 
     Attributes:
         category: of every mesh; None reads it from folders or labels.
         up: the axis that points up in the files: x, y, z, -x, -y or -z.
         scale: world units per unit of the files; None gives each mesh a bounding box with the diagonal 1.
-        drop_hidden: leave points out of the ground truth that neither a view nor anybody outside can see.
-        orbit: where the cameras stand.
+        drop_hidden: leave out ground-truth points that are visible neither in a view nor from outside.
+        orbit: positions of the cameras.
     """
 
     category: str | None = None
@@ -56,7 +56,7 @@ class MeshOptions:
     orbit: Orbit = dataclasses.field(default_factory=Orbit)
 
     def check(self) -> None:
-        """Refuse what cannot be.
+        """Refuses options that are out of range.
 
         Raises:
             UserError: an unknown axis, a scale that is not positive, or cameras that cannot hold a shape.
@@ -118,17 +118,17 @@ class _Job:
 
 
 def convert(
-    sources: Sequence[Path],
-    out: Path,
+    sources: str | Path | Sequence[str | Path],
+    out: str | Path,
     *,
-    labels: Path | None = None,
+    labels: str | Path | None = None,
     size: int = 224,
     views: int = 8,
     seed: int = 0,
     processes: int | None = None,
     options: MeshOptions | None = None,
 ) -> MeshReport:
-    """Make a dataset of meshes; running it again finishes or extends it.
+    """Makes a data tree of meshes; running it again finishes or extends it.
 
     Args:
         sources: folders, .zip and .sh3f archives, and mesh files (OBJ with its materials, GLB, PLY, OFF, STL).
@@ -142,15 +142,17 @@ def convert(
         options: of the meshes and the cameras.
 
     Raises:
-        UserError: sources without meshes, an unreadable label file, an option that cannot be, a folder that holds
+        UserError: sources without meshes, an unreadable label file, an option out of range, a folder that holds
             something else, not a single usable mesh (nothing is left behind then), or a full disk.
     """
-    options = options or MeshOptions()
+    options, out = options or MeshOptions(), Path(out)
+    labels = None if labels is None else Path(labels)
+    sources = [sources] if isinstance(sources, str | Path) else sources
     for name, value, low, high in (("size", size, 16, 2048), ("views", views, 1, 256)):
         if not low <= value <= high:
             raise UserError(f"{name} must be between {low} and {high}; got {value}")
     if labels is not None and options.category is not None:
-        raise UserError("labels and category both say what the meshes are; give one of them")
+        raise UserError("labels and category both set the category of the meshes; give one of them")
     options.check()
     wanted = read_labels(labels) if labels is not None else None
     with tempfile.TemporaryDirectory(prefix="meshes-") as scratch:
@@ -162,24 +164,24 @@ def convert(
             failures |= absent
         if options.category is not None:
             meshes = of_category(meshes, options.category)
-        store.claim(out, _settings(size, views, seed, options))
+        tree_files.prepare_output(out, _settings(size, views, seed, options))
         jobs = [
             _Job(mesh, shape, out, size, views, seed, options)
             for mesh, shape in zip(meshes, shape_ids(meshes), strict=True)
         ]
         made = kept = 0
-        for job, result in run_all(
-            _convert_one, jobs, processes=processes, desc="rendering meshes", unit="mesh"
+        for job, result in map_unordered(
+            _convert_one, jobs, processes=processes, title="rendering meshes", unit="mesh"
         ):
             if isinstance(result, Exception):
                 failures[job.mesh.name] = str(result)
             else:
                 made += result
                 kept += not result
-    counts = store.write_lists(out, seed=seed)
+    counts = tree_files.write_lists(out, seed=seed)
     totals = {split: sum(by_synset.values()) for split, by_synset in counts.items()}
     if not sum(totals.values()):
-        store.discard(out)
+        tree_files.discard(out)
         name, reason = next(iter(failures.items()))
         others = f" (and {len(failures) - 1} others)" if len(failures) > 1 else ""
         raise UserError(f"no usable mesh; {name}: {reason}{others}")
@@ -193,7 +195,7 @@ def convert(
 
 
 def _settings(size: int, views: int, seed: int, options: MeshOptions) -> dict:
-    """What must be the same throughout a dataset."""
+    """The settings that must be the same throughout a dataset."""
     return {
         "kind": "meshes",
         "seed": seed,
@@ -218,8 +220,8 @@ def _write_left_out(out: Path, failures: dict[str, str]) -> None:
 
 
 def _convert_one(job: _Job) -> int | Exception:
-    """Make one shape if it is not there yet; how many were made."""
-    if store.is_written(job.out, job.shape):
+    """Makes one shape if it is not there yet; returns how many were made."""
+    if tree_files.is_written(job.out, job.shape):
         return 0
     options = job.options
     try:
@@ -238,13 +240,13 @@ def _convert_one(job: _Job) -> int | Exception:
         empty = np.flatnonzero(~np.isfinite(views.depth).any((1, 2)))
         if len(empty):
             raise MeshError(
-                f"view {empty[0]} of {job.views} shows nothing of it: it is too thin or too small"
+                f"view {empty[0]} of {job.views} shows nothing: the mesh is too thin or too small for its pixels"
             )
         if options.drop_hidden:
-            points = sample_seen(renderer, camera, store.POINTS, samples)
+            points = sample_visible(renderer, camera, tree_files.POINTS, samples)
         else:
-            points, _ = sample_triangles(surface.vertices[surface.faces], store.POINTS, samples)
-        store.write_shape(job.out, job.shape, views, points)
+            points, _ = sample_triangles(surface.vertices[surface.faces], tree_files.POINTS, samples)
+        tree_files.write_shape(job.out, job.shape, views, points)
     except (MeshError, UserError, OSError) as error:
         return error
     except Exception as error:  # whatever is wrong with one mesh, the others must be made

@@ -1,12 +1,13 @@
-"""Photographs to what the network expects: the object alone on white, in a square, as large as in training.
+"""Photographs to pictures as the network expects them: the object alone on white, in a square, as large as in training.
 
     SOURCE/<object>/<name>.jpg                        one folder for each object
     SOURCE/[chair_final/]<listing>_<number>.JPG       Stanford Online Products: one listing is one object
     SOURCE/<name>.jpg                                 a single object
 
 become `OUT/<object>/<name>.png`, with `OUT/<object>/masks/<name>.png`, white where the object was found, as large as
-the photograph. A mask beside a photograph (`<name>_mask.png` or `masks/<name>.png`) goes before its alpha channel, and
-that before a search for a plain background; so a mask that came out wrong is mended by hand and given back.
+the photograph. Where the object is comes from a mask beside the photograph (`<name>_mask.png` or `masks/<name>.png`) if
+there is one, else from its transparency, else from a search for a plain background. So a wrong mask can be corrected by
+hand and put beside the photograph.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from train.data import store
+from train.data import tree_files
 from train.data.cutout import cut_out
 from train.data.images import read_rgba
-from train.data.work import run_all
 from train.errors import UserError
 from train.files import replacing, write_text
+from train.processes import map_unordered
 
 MASKS = "masks"
 
@@ -40,7 +41,7 @@ _RECORD = "photos.json"
 
 @dataclasses.dataclass(frozen=True)
 class Photo:
-    """A photograph in the source: of which object, under which name it is kept, and its given mask."""
+    """A photograph: the object it shows, the name of the picture that is made of it, its file, and that of its mask."""
 
     object: str
     name: str
@@ -49,13 +50,22 @@ class Photo:
 
     @property
     def title(self) -> str:
-        """How it is called in reports."""
+        """Its name in reports."""
         return f"{self.object}/{self.path.name}"
 
 
 @dataclasses.dataclass(frozen=True)
 class PhotosReport:
-    """What `convert_photos` did; `found` and `failures` say it for each photograph."""
+    """What `convert_photos` did.
+
+    Attributes:
+        out: the new folder.
+        kept: photographs that an earlier run had cut out.
+        objects: in the folder.
+        found: what was found in each photograph of this run, by its title.
+        ways: how many objects were found by a mask, by transparency ("alpha"), by a plain background.
+        failures: reasons by the title of the photograph.
+    """
 
     out: Path
     kept: int
@@ -88,15 +98,15 @@ def _some(lines: list[str], most: int = 40) -> list[str]:
 
 
 def convert_photos(
-    source: Path,
-    out: Path,
+    source: str | Path,
+    out: str | Path,
     *,
     size: int = 224,
     fewest: int = 1,
     objects: int | None = None,
     processes: int | None = None,
 ) -> PhotosReport:
-    """Cut the objects out of photographs; running it again finishes or extends it.
+    """Cuts the objects out of photographs; running it again finishes or extends it.
 
     Args:
         source: folder of folders, a folder of one object, or Stanford Online Products.
@@ -109,6 +119,7 @@ def convert_photos(
     Raises:
         UserError: no photographs, or not a single usable one; a folder that holds something else.
     """
+    source, out = Path(source), Path(out)
     if not 16 <= size <= 2048:
         raise UserError(f"size must be between 16 and 2048; got {size}")
     if fewest < 1 or (objects is not None and objects < 1):
@@ -120,14 +131,14 @@ def convert_photos(
         said = "".join(f"; {name}: {reason}" for name, reason in list(failures.items())[:1])
         raise UserError(f"no photographs{few} in {source}; looked for {', '.join(_ENDINGS)}{said}")
     chosen = [photo for name in list(by_object)[:objects] for photo in by_object[name]]
-    store.claim(out, {"kind": "photos", "size": size})
+    tree_files.prepare_output(out, {"kind": "photos", "size": size})
     for leftover in list(out.glob("**/.*.tmp")):
         leftover.unlink(missing_ok=True)
     record = _read_record(out)
     jobs = [_Job(photo, out, size) for photo in chosen if not _is_done(photo, out)]
     found: dict[str, str] = {}
     ways: Counter[str] = Counter()
-    for job, result in run_all(_cut_one, jobs, processes=processes, desc="cutting out", unit="photo"):
+    for job, result in map_unordered(_cut_one, jobs, processes=processes, title="cutting out", unit="photo"):
         if isinstance(result, tuple):
             ways[result[0]] += 1
             found[job.photo.title] = result[1]
@@ -137,7 +148,7 @@ def convert_photos(
     if not kept and not found:
         title, reason = next(iter(failures.items()))
         others = f" (and {len(failures) - 1} others)" if len(failures) > 1 else ""
-        store.discard(out)
+        tree_files.discard(out)
         raise UserError(f"no photograph can be used; {title}: {reason}{others}")
     found = {job.photo.title: found[job.photo.title] for job in jobs if job.photo.title in found}
     record = {"found": {**record.get("found", {}), **found}, "left out": failures}
@@ -146,12 +157,13 @@ def convert_photos(
     return PhotosReport(out, kept, len(made), found, dict(ways), failures)
 
 
-def find_photos(source: Path) -> tuple[dict[str, list[Photo]], dict[str, str]]:
-    """The photographs below a folder by object, and why some files are none.
+def find_photos(source: str | Path) -> tuple[dict[str, list[Photo]], dict[str, str]]:
+    """The photographs below a folder by object, and why some files cannot be read, by name.
 
     Raises:
         UserError: `source` is no folder.
     """
+    source = Path(source)
     if not source.is_dir():
         raise UserError(f"{source} is no folder; name one that holds a folder of photographs for each object")
     by_folder: dict[Path, list[Path]] = defaultdict(list)
@@ -208,7 +220,7 @@ def _is_done(photo: Photo, out: Path) -> bool:
 
 
 def _cut_one(job: _Job) -> tuple[str, str] | Exception:
-    """Write one mask and then its picture; the way and the words of what was found."""
+    """Writes one mask and then its picture; returns how the object was found, and a description."""
     photo = job.photo
     try:
         made = cut_out(read_rgba(photo.path), size=job.size, given=photo.mask and read_rgba(photo.mask))
@@ -219,7 +231,7 @@ def _cut_one(job: _Job) -> tuple[str, str] | Exception:
         ):
             with replacing(path) as temporary:
                 Image.fromarray(pixels).save(temporary, format="PNG")
-    except UserError as error:
+    except (UserError, OSError) as error:  # a full disk among them, which stops everything
         return error
     except Exception as error:  # whatever is wrong with one photograph, the others must be made
         return UserError(f"{type(error).__name__}: {error}")

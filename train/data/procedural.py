@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from train.data import store
+from train.data import tree_files
 from train.data.categories import SYNSET_OF
 from train.data.families import FAMILIES, MODES, Cone
 from train.data.render import MAX_RADIUS, Renderer, Views, draw_camera, orbit_camera
 from train.data.solids import Solid, sample_union, surface_of
-from train.data.work import run_all
 from train.errors import UserError
+from train.processes import map_unordered
 
 _SAME_DEPTH, _SAME_COLOUR = 1e-3, 3  # world units; steps of 255
-_FRONT, _SEPARATION = 0.005, 2.2  # tighter than the rules, 0.01 and 2
+_FRONT, _SEPARATION = 0.005, 2.2  # for acceptance; tighter than the rules, 0.01 and 2
 _ATTEMPTS = 60
 
 
@@ -42,12 +42,12 @@ class Ambiguity:
 
     @property
     def holds(self) -> bool:
-        """The same front, other backs, modes that can be told apart, and nothing that a frame would cut."""
+        """The rules: equal fronts, different backs, distinguishable modes, and nothing outside of the frame."""
         return self.front < 0.01 and self.back > 0.1 and self.separation >= 2 and self.radius <= MAX_RADIUS
 
     @property
     def accepted(self) -> bool:
-        """`holds`, with some room left: other pictures and samples of the same shapes must find so too."""
+        """`holds` with a margin, so that it also holds in other views and samples of the same shapes."""
         return self.holds and self.front < _FRONT and self.separation >= _SEPARATION
 
 
@@ -89,11 +89,11 @@ class _Job:
 
 
 def variants_of(category: str, seed: int | Sequence[int]) -> tuple[list[Solid], ...]:
-    """All shapes that agree with one front: the hidden variants of one object, one for each mode.
+    """All shapes that share one front: the hidden variants of one object, one for each mode.
 
-    Objects are drawn until one passes `ambiguity`; the same seed always gives the same variants. A family without
-    designed ambiguity gives one shape. To score whether predictions cover what one image leaves open, compare them
-    with samples of each variant.
+    Objects are drawn until one passes the rules of `ambiguity`; the same seed always gives the same variants. A family
+    without designed ambiguity gives one shape. To measure whether predictions cover all shapes that are consistent with
+    an image, compare them with samples of each variant.
 
     Example:
         >>> variants = variants_of("display", 0)
@@ -124,7 +124,7 @@ def variants_of(category: str, seed: int | Sequence[int]) -> tuple[list[Solid], 
 def ambiguity(
     variants: Sequence[list[Solid]], cone: Cone, *, size: int = 112, fronts: int = 3, sampling: int = 0
 ) -> Ambiguity:
-    """Measure the rules of ambiguity on the variants of one object.
+    """Measures how well one front hides the variants of one object.
 
     Args:
         variants: the same object with different backs.
@@ -142,7 +142,7 @@ def ambiguity(
     pairs = list(itertools.combinations(range(len(variants)), 2))
     changed = np.array([_changed_share(views[i], views[j]) for i, j in pairs])
     clouds = [
-        [sample_union(solids, store.POINTS, np.random.default_rng([sampling, k])) for k in range(2)]
+        [sample_union(solids, tree_files.POINTS, np.random.default_rng([sampling, k])) for k in range(2)]
         for solids in variants
     ]
     noise = [_chamfer(*pair) for pair in clouds]
@@ -155,7 +155,7 @@ def ambiguity(
 
 
 def generate(
-    out: Path,
+    out: str | Path,
     *,
     shapes: int,
     categories: Sequence[str] | None,
@@ -165,7 +165,7 @@ def generate(
     processes: int | None = None,
     variants: int = 1,
 ) -> ProceduralReport:
-    """Make a dataset of procedural objects; running it again finishes or extends it.
+    """Makes a data tree of procedural objects; running it again finishes or extends it.
 
     Args:
         out: folder of the dataset.
@@ -181,6 +181,7 @@ def generate(
     Raises:
         UserError: an unknown category, a number out of range, or a folder that holds something else.
     """
+    out = Path(out)
     names = tuple(FAMILIES) if categories is None else tuple(dict.fromkeys(categories))
     unknown = [name for name in names if name not in FAMILIES]
     if unknown or not names:
@@ -205,24 +206,26 @@ def generate(
         "variants": variants,
         "categories": list(names),
     }
-    store.claim(out, settings)
+    tree_files.prepare_output(out, settings)
     jobs = [_Job(out, names[i % len(names)], i, seed, size, views, variants) for i in range(shapes)]
     made, failures = 0, {}
-    for job, result in run_all(_make, jobs, processes=processes, desc="procedural shapes", unit="shape"):
+    for job, result in map_unordered(
+        _make, jobs, processes=processes, title="procedural shapes", unit="shape"
+    ):
         if isinstance(result, Exception):
             failures[f"{job.category} {job.index}"] = f"{job.category} {job.index}: {result}"
         else:
             made += result
-    counts = store.write_lists(out, seed=seed)
+    counts = tree_files.write_lists(out, seed=seed)
     totals = {split: sum(by_synset.values()) for split, by_synset in counts.items()}
     return ProceduralReport(out, made, sum(totals.values()) - made, names, totals, failures)
 
 
 def _make(job: _Job) -> int | Exception:
-    """Write the object's variants that are not there yet; how many were written."""
+    """Writes the object's variants that are not there yet; returns how many were written."""
     entropy = [job.seed, job.index]
     modes = np.random.default_rng([*entropy, 1]).permutation(FAMILIES[job.category].modes)[: job.variants]
-    missing = [int(mode) for mode in modes if not store.is_written(job.out, job.shape(int(mode)))]
+    missing = [int(mode) for mode in modes if not tree_files.is_written(job.out, job.shape(int(mode)))]
     if not missing:
         return 0
     try:
@@ -230,8 +233,10 @@ def _make(job: _Job) -> int | Exception:
         camera = draw_camera(np.random.default_rng([*entropy, 2]), job.views, job.size)
         for mode in missing:
             solids = solids_of_mode[mode]
-            points = sample_union(solids, store.POINTS, np.random.default_rng([*entropy, 3, mode]))
-            store.write_shape(job.out, job.shape(mode), Renderer(surface_of(solids)).render(camera), points)
+            points = sample_union(solids, tree_files.POINTS, np.random.default_rng([*entropy, 3, mode]))
+            tree_files.write_shape(
+                job.out, job.shape(mode), Renderer(surface_of(solids)).render(camera), points
+            )
     except (RuntimeError, OSError) as error:
         return error
     return len(missing)

@@ -1,4 +1,4 @@
-"""A z-buffer in plain numpy: what renders where embree has no wheel.
+"""A z-buffer in plain numpy, for platforms where embree has no wheel.
 
 For a ray (x, y, 1) in homogeneous pixels and a triangle with corners q0, q1, q2 there (q = K p in the camera frame),
 the edge functions e_i = (q_j x q_k) . (x, y, 1) are the hit point's barycentric weights up to scale, and its depth is
@@ -17,10 +17,11 @@ from train.data.surface import Hits, Surface
 
 _FACES_AT_ONCE = 1 << 16
 _ITEMS_AT_ONCE = 1 << 18
-"""Spans or pixels; with the faces, what bounds the memory: about 100 MB, whatever the mesh."""
+"""Spans or pixels; together with the faces at once this bounds the memory to about 100 MB for any mesh."""
 
 _SLIVER = 1e-6
-"""Square pixels, about: what is seen edge-on has no depth that rounding would leave, and meets no pixel's centre."""
+"""About square pixels. Triangles seen edge-on are left out: their depth would be rounding noise, and they cover no
+pixel centre."""
 
 
 class Rasteriser:

@@ -1,7 +1,7 @@
 """Views of a surface: exact depth at pixel centres, shaded colour, no OpenGL.
 
-What each pixel sees is found by embree, or by the z-buffer of `rasterise` where embree is not installed; all else is
-the same for both.
+Which face each pixel sees is found by embree, or by the z-buffer of `rasterise` where embree is not installed; the rest
+is the same for both.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Views:
 
 @dataclasses.dataclass(frozen=True)
 class Orbit:
-    """Where the cameras of a shape stand; the defaults are the paper's.
+    """Positions of a shape's cameras; the defaults are the paper's.
 
     Attributes:
         elevation_deg: lowest and highest.
@@ -61,7 +61,7 @@ class Orbit:
         return self.distance * float(np.sin(np.arctan(0.5 / self.focal)))
 
     def check(self) -> None:
-        """Refuse cameras that could not hold a shape of diagonal 1.
+        """Refuses cameras whose frame would cut a shape of diagonal 1.
 
         Raises:
             UserError: an elevation, distance or focal length that is out of range, or a frame that is too narrow.
@@ -84,14 +84,14 @@ class Orbit:
             )  # half a frame that holds the shape
             raise UserError(
                 f"at distance {self.distance:g} and focal {self.focal:g} the frame cuts shapes of diagonal 1; "
-                f"lower focal to {np.floor(50 * self.distance / widest) / 100:g}, or stand back"
+                f"lower focal to {np.floor(50 * self.distance / widest) / 100:g}, or raise distance"
             )
 
 
 def orbit_camera(
     azimuth_deg: np.ndarray, elevation_deg: np.ndarray, size: int, orbit: Orbit | None = None
 ) -> PinholeCamera:
-    """Cameras (V,) that look at the origin; azimuth 0 stands in front, at +z, and 90 at +x."""
+    """Cameras (V,) that look at the origin; azimuth 0 is in front, at +z, and 90 at +x."""
     orbit = orbit or Orbit()
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     eye = orbit.distance * np.stack(

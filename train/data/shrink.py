@@ -1,4 +1,4 @@
-"""One shape at the sizes at which a network looks at it and the front constraint compares it."""
+"""One shape at the sizes of training: images for the network's input, depth maps for the front constraint."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from diffpoint import PinholeCamera
-from train.data.tree import Shape, ShapeError
+from train.data.shape import Shape, ShapeError
 from train.errors import UserError
 
 Pool = Literal["decimate", "min"]
@@ -31,37 +31,18 @@ class Sizes:
     pool: Pool = "decimate"
 
 
-class SmallShape(NamedTuple):
-    """What training keeps of a shape.
-
-    Attributes:
-        id: "synset/model".
-        category: its name.
-        images: (V, 3, h, w) uint8.
-        depth: (V, S, S) float32 metric depth, +inf where empty; NaN if the shape came without depth maps.
-        K: (V, 3, 3) intrinsics for maps of S x S pixels.
-        cam_from_world: (V, 4, 4).
-        points: (P, 3) ground truth in the world frame.
-    """
-
-    id: str
-    category: str
-    images: Tensor
-    depth: Tensor
-    K: Tensor
-    cam_from_world: Tensor
-    points: Tensor
-
-
 class SmallDepth(NamedTuple):
-    """Depth maps at the comparison's size, with the cameras that belong to them."""
+    """Depth maps (V, S, S) at the size of the front constraint, and their cameras (V,)."""
 
     depth: Tensor
     camera: PinholeCamera
 
 
-def shrink(shape: Shape, sizes: Sizes) -> SmallShape:
+def shrink(shape: Shape, sizes: Sizes) -> Shape:
     """Brings images and depth maps to the sizes of training; the cameras follow the depth maps.
+
+    Returns:
+        The shape with images (V, 3, h, w) uint8, depth (V, S, S) and cameras for maps of S x S pixels.
 
     Raises:
         ShapeError: a view shows nothing.
@@ -70,20 +51,13 @@ def shrink(shape: Shape, sizes: Sizes) -> SmallShape:
     if shape.depth.isinf().flatten(1).all(1).any():
         raise ShapeError(f"{shape.id}: one of its views shows nothing")
     small = _small_depth(shape, sizes)
-    return SmallShape(
-        id=shape.id,
-        category=shape.category,
-        images=_bytes_at(shape.images, sizes.image_size),
-        depth=small.depth.contiguous(),
-        K=small.camera.K,
-        cam_from_world=small.camera.cam_from_world,
-        points=shape.points,
-    )
+    images = _bytes_at(shape.images, sizes.image_size)
+    return dataclasses.replace(shape, images=images, depth=small.depth.contiguous(), camera=small.camera)
 
 
 def _small_depth(shape: Shape, sizes: Sizes) -> SmallDepth:
     side, wanted = shape.depth.shape[-1], sizes.map_size
-    if not shape.has_depth:  # renderings to evaluate on: their pictures and their ground truth count
+    if not shape.has_depth:  # renderings to evaluate on: only their pictures and their ground truth are used
         unknown = torch.full((len(shape.depth), wanted, wanted), torch.nan)
         return SmallDepth(unknown, shape.camera.resize(wanted, wanted))
     if side % wanted:
@@ -101,7 +75,7 @@ def _bytes_at(images: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def decimate_depth(depth: Tensor, camera: PinholeCamera, *, size: int) -> SmallDepth:
-    """Keeps one pixel of every f x f block: the one at index f*i + f//2, at its own exact place.
+    """Keeps one pixel of every f x f block, the one at index f*i + f//2, and its exact position.
 
     Its centre, f*i + f//2 + 0.5, is the centre i + 0.5 of small pixel i of a camera whose principal point is
     shifted by half a large pixel (f even; none for f odd) before both are divided by f. Nothing is rounded.

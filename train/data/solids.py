@@ -1,4 +1,4 @@
-"""Closed coloured solids, what they are made from, and uniform samples of the outside of their union.
+"""Closed coloured solids, functions that make them, and uniform samples of the outer surface of their union.
 
 Most shapes are lofts: closed rings of corners, joined one to the next. `box`, `bar`, `revolved`, `ellipsoid`, `tube`,
 `body` and `wing` are lofts through rings of a kind. Units are the world's, y is up.

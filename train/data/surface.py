@@ -1,4 +1,4 @@
-"""Coloured triangles: what the renderer draws and the ground-truth cloud is sampled from."""
+"""Coloured triangles, which the renderer draws and from which ground-truth clouds are sampled."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Surface:
         vertices: (V, 3) float.
         faces: (F, 3) int.
         corner_colours: (F, 3, 3) float32 in [0, 1]: RGB at the corners of each face.
-        face_texture: (F,) int, index into `textures`, or -1 where the corner colours hold.
+        face_texture: (F,) int, index into `textures`, or -1 for faces that have corner colours.
         corner_uv: (F, 3, 2) float32, v up; read where `face_texture` >= 0.
         textures: images (h, w, 3) uint8.
     """

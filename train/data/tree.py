@@ -1,4 +1,4 @@
-"""Reading the dataset on disk: `ShapeTree`."""
+"""Reading data trees: `ShapeTree`."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from tqdm import tqdm
-
-from diffpoint.io import read_points
-from train.data import store
+from train.data import tree_files
+from train.data.axis_frames import AS_IT_IS, SAMPLE, Frame, find_frame
 from train.data.categories import CATEGORY_OF, SYNSET_OF, category_of, synset_of
-from train.data.choy import Choy, find_renderings
-from train.data.frames import AS_IT_IS, SAMPLE, Frame, find_frame, is_own
-from train.data.release import Release
-from train.data.shape import Shape, ShapeError, ViewsRead, read_file
+from train.data.choy_layout import ChoyLayout, find_renderings
+from train.data.release_layout import ReleaseLayout
+from train.data.shape import Shape, ShapeError, is_shape_id
 from train.errors import UserError
+from train.processes import progress_bar
 
 __all__ = ["Shape", "ShapeError", "ShapeTree", "frame_of", "layout_of", "read_shape"]
 
@@ -28,7 +26,8 @@ class ShapeTree:
     where clouds and cameras of a tree from elsewhere are in different frames, they are turned when read (`frame_of`).
 
     A broken shape raises `ShapeError` from `tree[i]`; `iter_valid` and `load_all` leave it out, and `skipped`
-    names it with the reason. Shapes without files are found at once and are not counted in `len(tree)`.
+    names it with the reason. Shapes without files, and lines of a list that are no "synset/model", are skipped when the
+    tree is opened and are not counted in `len(tree)`.
 
     Args:
         path: a folder made by `python -m train data`, the paper's release, or Choy's renderings.
@@ -45,8 +44,8 @@ class ShapeTree:
         self.path = Path(path)
         self.split = split
         self.skipped: dict[str, str] = {}
-        if split not in store.SPLITS:
-            raise UserError(f"ShapeTree: split must be one of {', '.join(store.SPLITS)}; got {split!r}")
+        if split not in tree_files.SPLITS:
+            raise UserError(f"ShapeTree: split must be one of {', '.join(tree_files.SPLITS)}; got {split!r}")
         layout = layout_of(self.path)
         members = layout.listed(split)
         self.ids: list[str] = []
@@ -73,17 +72,17 @@ class ShapeTree:
                 self.skipped[shape] = str(error)
 
     def load_all(self, *, progress: bool = True) -> list[Shape]:
-        """Read every shape into memory; the broken ones are named on the progress line and in `skipped`.
+        """Reads every shape into memory; the broken ones are named on the progress line and in `skipped`.
 
         Raises:
             UserError: not a single shape can be read.
         """
-        bar = tqdm(
+        bar = progress_bar(
             self.iter_valid(),
             total=len(self),
-            desc=f"reading {self.split}",
+            title=f"reading {self.split}",
             unit="shape",
-            disable=not progress,
+            progress=progress,
         )
         shapes = list(bar)
         if progress:
@@ -117,44 +116,45 @@ class Layout(Protocol):
         ...
 
     def listed(self, split: str) -> dict[str, list[str]]:
-        """Synset -> the shapes of a split, whether they are there or not."""
+        """Synset -> the shapes of a split, as the lists name them, whether they exist or not."""
         ...
 
     def folder(self, shape: str) -> Path:
-        """Where the views are."""
+        """The folder with the views of a shape."""
         ...
 
     def cloud_file(self, shape: str) -> Path:
-        """Where the ground truth is."""
+        """The file with the ground-truth cloud of a shape."""
         ...
 
     def on_disk(self) -> list[str]:
         """The shapes that have a folder, listed or not."""
         ...
 
-    def read_views(self, shape: str) -> ViewsRead:
-        """Pictures, depth and cameras, as the files have them; a `ShapeError` names what is broken."""
+    def read(self, shape: str) -> Shape:
+        """A shape in the frames of its files; a `ShapeError` names what is missing or broken."""
         ...
 
 
-def layout_of(root: Path) -> Layout:
+def layout_of(root: str | Path) -> Layout:
     """How the tree at `root` is laid out.
 
     Raises:
         UserError: there is no tree, or it lacks what it needs.
     """
-    if (root / store.RENDERS).is_dir():
-        return Release(root)
+    root = Path(root)
+    if (root / tree_files.RENDERS).is_dir():
+        return ReleaseLayout(root)
     renderings = find_renderings(root)
     if renderings is None:
         raise UserError(
             f"no data at {root}; make some with: python -m train data procedural --out {root} --shapes 400"
         )
-    return Choy(root, renderings)
+    return ChoyLayout(root, renderings)
 
 
-def require_depth(roots: Iterable[Path]) -> None:
-    """Refuse trees that cannot be trained on.
+def require_depth(roots: Iterable[str | Path]) -> None:
+    """Refuses trees that cannot be trained on.
 
     Raises:
         UserError: a tree has no depth maps, or there is no tree.
@@ -167,22 +167,23 @@ def require_depth(roots: Iterable[Path]) -> None:
             )
 
 
-def read_shape(root: Path, shape: str) -> Shape:
-    """Read the shape "synset/model", in the world with y up.
+def read_shape(root: str | Path, shape: str) -> Shape:
+    """Reads the shape "synset/model", in the world with y up.
 
     Raises:
-        ShapeError: a file is missing or broken, or the files do not fit together.
+        ShapeError: no such name, a file is missing or broken, or the files do not fit together.
     """
-    return frame_of(root).applied(_read_as_it_is(layout_of(root), shape))
+    return frame_of(root).applied(_read_unturned(layout_of(root), shape))
 
 
-def frame_of(root: Path) -> Frame:
-    """What has to be turned in this tree when it is read; `data check` prints it.
+def frame_of(root: str | Path) -> Frame:
+    """How clouds and cameras of this tree are turned when they are read; `data check` prints it.
 
-    Found out once per process from a few shapes that are spread over the tree, without writing anything. Trees that
-    this program made are right and not looked at.
+    Found once per process from a few shapes that are spread over the tree, without writing anything. Trees that this
+    program made need no turning and are not examined.
     """
-    if is_own(root):
+    root = Path(root)
+    if tree_files.is_own(root):
         return AS_IT_IS
     return _found_frame(root.resolve(), root.stat().st_mtime_ns)
 
@@ -193,16 +194,19 @@ def _found_frame(root: Path, _: int) -> Frame:
 
 
 def sample_shapes(layout: Layout, among: Sequence[str] | None = None) -> list[Shape]:
-    """Up to `SAMPLE` shapes that can be read, spread over the tree or over those named, as their files have them."""
+    """Up to `SAMPLE` readable shapes, spread over the tree or over those named, in the frames of their files."""
     if among is None:
         among = [
-            shape for split in store.SPLITS for members in layout.listed(split).values() for shape in members
+            shape
+            for split in tree_files.SPLITS
+            for members in layout.listed(split).values()
+            for shape in members
         ]
     order = [among[(number * len(among)) // (4 * SAMPLE)] for number in range(4 * SAMPLE)] if among else []
     found: list[Shape] = []
     for shape in dict.fromkeys(order[start + step] for step in range(4) for start in range(0, len(order), 4)):
         try:
-            found.append(_read_as_it_is(layout, shape))
+            found.append(_read_unturned(layout, shape))
         except ShapeError:
             continue
         if len(found) == SAMPLE:
@@ -210,22 +214,19 @@ def sample_shapes(layout: Layout, among: Sequence[str] | None = None) -> list[Sh
     return found
 
 
-def _read_as_it_is(layout: Layout, shape: str) -> Shape:
-    folder, cloud = layout.folder(shape), layout.cloud_file(shape)
-    if not folder.is_dir():
-        raise ShapeError(f"{shape}: no folder {folder}")
-    views = layout.read_views(shape)
-    return Shape(
-        images=views.images,
-        depth=views.depth,
-        camera=views.camera,
-        points=read_file(shape, cloud, read_points),
-        id=shape,
-        category=category_of(shape.split("/")[0]),
-    )
+def _read_unturned(layout: Layout, shape: str) -> Shape:
+    reason = _missing(layout, shape)
+    if reason:
+        raise ShapeError(reason)
+    return layout.read(shape)
 
 
 def _missing(layout: Layout, shape: str) -> str | None:
+    """Why a shape that a list names cannot be read, as far as names tell; None if its files are there."""
+    if not is_shape_id(shape):
+        return (
+            f"{shape}: not of the form <synset>/<model>, as the lines of the lists in {layout.root} must be"
+        )
     folder, cloud = layout.folder(shape), layout.cloud_file(shape)
     if not folder.is_dir():
         return f"{shape}: no folder {folder}"

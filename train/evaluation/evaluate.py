@@ -1,18 +1,18 @@
-"""How good a run is on shapes it has never seen, beside answers that need no network.
+"""Evaluates a run on held-out shapes, beside two retrieval baselines, and writes evaluation.json.
 
-All distances are un-squared and x100. `evaluation.json` keeps every figure with the configuration that made it:
+All distances are un-squared and x100. The fields of `evaluation.json`:
 
-    profile, config, data, seeds   what was scored, and how
-    views                          number of views -> figures (`train.scoring.FIGURES`): mean over seeds and shapes
-    spread                         the same figures' standard deviation over seeds
-    class_average                  the same figures, every category counting once
-    categories                     category -> its number of shapes and its views
-    random_codes                   as views, without search and descent; empty for a network without codes
-    agreement                      number of views -> consistency loss at random codes, after search, after descent,
-                                   and the share of reconstructions whose loss the descent lowered
-    diversity                      mean chamfer distance between predictions of one image, 10 random codes each
-    sensitivity                    how far predictions move with the image and with the code
-    medoid, nearest_image          the most typical training shape; the one whose pictures look most alike
+    profile, config, data, seeds   what was evaluated, and how
+    views                          number of views -> metrics (`per_shape.METRICS`), means over seeds and shapes
+    spread                         the metrics' standard deviation over seeds
+    class_average                  the metrics as unweighted means over categories
+    categories                     category -> its number of shapes, and `views` of these
+    random_codes                   as `views`, without search and descent; empty for a network without codes
+    agreement                      number of views -> consistency loss with random codes, after the search and after
+                                   the descent, and the share of reconstructions whose loss the descent lowered
+    diversity                      mean chamfer distance between predictions from one image with 10 random codes
+    sensitivity                    change of the prediction with the image and with the code (`sensitivity.py`)
+    medoid, nearest_image          the retrieval baselines (`retrieval.py`)
 """
 
 from __future__ import annotations
@@ -22,18 +22,26 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeGuard
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from models import Generator, Predictor
+from models import Predictor
 from train.config import FitConfig
 from train.data.batches import LoadedSplit
 from train.errors import UserError
 from train.evaluation.metrics import cloud_errors, thin_out
-from train.evaluation.per_shape import Scores, average, diversity, means, score, spreads, stacked
+from train.evaluation.per_shape import (
+    ShapeMetrics,
+    average_rows,
+    diversity,
+    evaluate_split,
+    mean_metrics,
+    stack_seeds,
+    std_over_seeds,
+)
 from train.evaluation.retrieval import medoid, nearest_by_image
 from train.evaluation.runs import open_run
 from train.evaluation.sensitivity import sensitivity
@@ -46,34 +54,34 @@ _SENSITIVITY_IMAGES = 24
 
 
 def evaluate(
-    run: Path,
-    data: Path,
+    run: str | Path,
+    data: str | Path,
     *,
     split: Literal["train", "val", "test"] = "test",
     seeds: Sequence[int] = (0,),
     views: Sequence[int] = VIEW_COUNTS,
     limit: int | None = None,
-    out: Path | None = None,
+    out: str | Path | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Scores a run on a split and writes evaluation.json.
+    """Evaluates a run on a split and writes evaluation.json.
 
     Args:
         run: a run's directory, a .safetensors file of one (then with its profile's default settings), or the word
             `pretrained`.
-        data: root of a data tree; its train split gives the trivial answers.
-        split: the split to score.
-        seeds: each draws other codes and another choice of views; figures are means over them.
-        views: numbers of views; those the data do not have are left out.
-        limit: at most that many shapes of the split.
-        out: where to write; RUN/evaluation.json by default.
-        progress: show bars and print the table.
+        data: root of a data tree; the retrieval baselines search its train split.
+        split: the split to evaluate.
+        seeds: each determines the random codes and the choice of views; metrics are means over seeds.
+        views: numbers of input views; those larger than the data have are skipped.
+        limit: evaluate at most this many shapes of the split.
+        out: the file to write; RUN/evaluation.json by default.
+        progress: show progress bars and print the table.
 
     Returns:
         What was written.
 
     Raises:
-        UserError: no such run or data, nothing to score, or numbers out of range.
+        UserError: no such run or data, nothing to evaluate, or numbers out of range.
     """
     begun = time.monotonic()
     _check(seeds, views, limit)
@@ -89,7 +97,7 @@ def evaluate(
     if not counts:
         raise UserError(f"{data} has {test.views} views per shape; none of {list(views)} can be evaluated")
 
-    found, random_codes = _score(model, test, config, counts=counts, seeds=seeds, progress=progress)
+    found, random_codes = _measure(model, test, config, counts=counts, seeds=seeds, progress=progress)
     result: dict[str, Any] = {
         "profile": config.profile,
         "config": dataclasses.asdict(config),
@@ -101,10 +109,10 @@ def evaluate(
             "train_shapes": len(train),
         },
         "seeds": list(seeds),
-        **_network_figures(model, test, found, random_codes, seeds=seeds),
-        **_trivial_figures(test, train, views=counts, points=model.points),
+        **_network_metrics(model, test, found, random_codes, seeds=seeds),
+        **_retrieval_metrics(test, train, views=counts, points=model.points),
     }
-    write_text(out, json.dumps(result, indent=2) + "\n")
+    write_text(Path(out), json.dumps(result, indent=2) + "\n")
     if progress:
         print(format_table(result))
         print(f"took {time.monotonic() - begun:.0f} s; wrote {out}")
@@ -120,7 +128,7 @@ def _check(seeds: Sequence[int], views: Sequence[int], limit: int | None) -> Non
         raise UserError(f"--limit must be at least 1; got {limit}")
 
 
-def _score(
+def _measure(
     model: Predictor,
     test: LoadedSplit,
     config: FitConfig,
@@ -128,13 +136,13 @@ def _score(
     counts: Sequence[int],
     seeds: Sequence[int],
     progress: bool,
-) -> tuple[dict[int, Scores], dict[int, Scores]]:
-    """Number of views -> scores of all seeds, with search and descent; and, if there are codes, without."""
+) -> tuple[dict[int, ShapeMetrics], dict[int, ShapeMetrics]]:
+    """Number of views -> metrics (S, M) with search and descent; and the same with random codes, {} without codes."""
     ways = [config.inference]
-    if _takes_codes(model):
+    if model.takes_codes:
         ways.append(dataclasses.replace(config.inference, groups=1, steps=0))
-    tables: list[dict[int, Scores]] = [{} for _ in ways]
-    # A descent over n views compares n (n - 1) pairs again and again: the bar counts work, not shapes.
+    tables: list[dict[int, ShapeMetrics]] = [{} for _ in ways]
+    # A step of descent over n views compares n (n - 1) pairs of clouds: the bar counts these, not shapes.
     work = {n: n * n for n in counts}
     total = len(seeds) * len(test) * sum(work.values())
     with tqdm(total=total, disable=not progress, bar_format="{l_bar}{bar}| {elapsed} < {remaining}") as bar:
@@ -142,24 +150,24 @@ def _score(
             bar.set_description(f"{n} view{'s' if n > 1 else ''}")
             for settings, table in zip(ways, tables, strict=True):
                 if n == 1 and 1 in tables[0]:
-                    table[1] = tables[0][1]  # one view has nothing to search for
+                    table[1] = tables[0][1]  # with one view there is no search
                     continue
                 step = work[n] if settings is config.inference else 0
 
                 def done(shapes: int, step: int = step) -> None:
                     bar.update(shapes * step)
 
-                table[n] = stacked(
-                    [score(model, test, settings, views=n, seed=seed, done=done) for seed in seeds]
+                table[n] = stack_seeds(
+                    [evaluate_split(model, test, settings, views=n, seed=seed, done=done) for seed in seeds]
                 )
     return tables[0], tables[1] if len(tables) > 1 else {}
 
 
-def _network_figures(
+def _network_metrics(
     model: Predictor,
     test: LoadedSplit,
-    found: dict[int, Scores],
-    random_codes: dict[int, Scores],
+    found: dict[int, ShapeMetrics],
+    random_codes: dict[int, ShapeMetrics],
     *,
     seeds: Sequence[int],
 ) -> dict[str, Any]:
@@ -168,33 +176,32 @@ def _network_figures(
         for name in sorted(set(test.categories))
     }
     categories = {
-        name: {"shapes": len(shapes), "views": {str(n): means(scores, shapes) for n, scores in found.items()}}
+        name: {
+            "shapes": len(shapes),
+            "views": {str(n): mean_metrics(metrics, shapes) for n, metrics in found.items()},
+        }
         for name, shapes in members.items()
     }
     moved = sensitivity(model, _one_image_per_shape(test))
     return {
-        "views": {str(n): means(scores) for n, scores in found.items()},
-        "spread": {str(n): spreads(scores) for n, scores in found.items()},
+        "views": {str(n): mean_metrics(metrics) for n, metrics in found.items()},
+        "spread": {str(n): std_over_seeds(metrics) for n, metrics in found.items()},
         "class_average": {
-            str(n): average([entry["views"][str(n)] for entry in categories.values()]) for n in found
+            str(n): average_rows([entry["views"][str(n)] for entry in categories.values()]) for n in found
         },
         "categories": categories,
-        "random_codes": {str(n): means(scores) for n, scores in random_codes.items()},
+        "random_codes": {str(n): mean_metrics(metrics) for n, metrics in random_codes.items()},
         "agreement": {
-            str(n): _agreement(scores, random_codes[n])
-            for n, scores in found.items()
-            if "searched" in scores and n in random_codes
+            str(n): _agreement(metrics, random_codes[n])
+            for n, metrics in found.items()
+            if "searched" in metrics and n in random_codes
         },
-        "diversity": _diversity(model, test, members, seeds=seeds) if _takes_codes(model) else None,
+        "diversity": _diversity(model, test, members, seeds=seeds) if model.takes_codes else None,
         "sensitivity": {"image": moved.image, "code": moved.code},
     }
 
 
-def _takes_codes(model: Predictor) -> TypeGuard[Generator]:
-    return isinstance(model, Generator) and not model.config.deterministic
-
-
-def _agreement(found: Scores, random_codes: Scores) -> dict[str, float]:
+def _agreement(found: ShapeMetrics, random_codes: ShapeMetrics) -> dict[str, float]:
     return {
         "random": random_codes["consistency"].mean().item(),
         "searched": found["searched"].mean().item(),
@@ -204,37 +211,35 @@ def _agreement(found: Scores, random_codes: Scores) -> dict[str, float]:
 
 
 def _diversity(
-    model: Generator, test: LoadedSplit, members: dict[str, Tensor], *, seeds: Sequence[int]
+    model: Predictor, test: LoadedSplit, members: dict[str, Tensor], *, seeds: Sequence[int]
 ) -> dict[str, Any]:
-    apart = torch.stack([diversity(model, test, codes=_DIVERSITY_CODES, seed=seed) for seed in seeds])
+    distance = torch.stack([diversity(model, test, codes=_DIVERSITY_CODES, seed=seed) for seed in seeds])
     return {
         "codes": _DIVERSITY_CODES,
-        "mean": apart.mean().item(),
-        "categories": {name: apart[:, shapes].mean().item() for name, shapes in members.items()},
+        "mean": distance.mean().item(),
+        "categories": {name: distance[:, shapes].mean().item() for name, shapes in members.items()},
     }
 
 
-def _trivial_figures(
+def _retrieval_metrics(
     test: LoadedSplit, train: LoadedSplit, *, views: Sequence[int], points: int
 ) -> dict[str, Any]:
-    """The two answers without a network, compared like a prediction."""
+    """Errors of the two retrieval baselines, measured like those of a prediction."""
 
-    def scores(clouds: Tensor) -> dict[str, float]:
+    def mean_errors(clouds: Tensor) -> dict[str, float]:
         clouds = clouds.contiguous()
-        errors, thinned = (
-            cloud_errors(clouds, test.points),
-            cloud_errors(thin_out(clouds, points), test.points),
-        )
+        errors = cloud_errors(clouds, test.points)
+        thinned = cloud_errors(thin_out(clouds, points), test.points)
         return {"cd": errors.cd.mean().item(), "fps_cd": thinned.cd.mean().item()}
 
     by_image = nearest_by_image(test, train, views=views)
     return {
-        "medoid": scores(train.points[medoid(train.points)].expand_as(test.points)),
-        "nearest_image": {str(n): scores(train.points[index]) for n, index in by_image.items()},
+        "medoid": mean_errors(train.points[medoid(train.points)].expand_as(test.points)),
+        "nearest_image": {str(n): mean_errors(train.points[index]) for n, index in by_image.items()},
     }
 
 
 def _one_image_per_shape(test: LoadedSplit) -> Tensor:
-    """Up to 24 images of as many shapes as there are; a lone shape shows two of its views."""
+    """(B, 3, H, W) images of up to 24 shapes, one of each; of a single shape two views."""
     numbers = torch.arange(max(2, min(_SENSITIVITY_IMAGES, len(test))))
     return test.float_images(numbers % len(test), (numbers // len(test))[:, None] % test.views)[:, 0]

@@ -1,6 +1,6 @@
-"""Several images of one object -> one shape: find the codes on which the single-view predictions agree.
+"""Several images of one object -> one shape: optimise the codes so that the single-view predictions agree.
 
-Algorithm 1 of the paper. No camera is needed: every prediction lives in the same world frame.
+Algorithm 1 of the paper. Cameras are not needed: all predictions are in the same world frame.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from diffpoint import consistency_loss
-from models import Generator, Predictor
+from models import Predictor
 from train.config import InferenceConfig
 
-# Objects are worked on in groups that together predict about so many points: 16 objects in 24 views of the cpu
-# profile, 4 of the full one. The memory of a gradient step then stays near a gigabyte at most.
+# Predicted points of the objects that are processed together: 16 objects with 24 views at the cpu profile, 4 at the
+# full one. This keeps the memory of a gradient step near a gigabyte.
 _POINTS_AT_ONCE = 200_000
 
 
@@ -25,10 +25,9 @@ class Reconstruction(NamedTuple):
 
     Attributes:
         points: (B, V*N, 3) the concatenated clouds, world frame; (B, N, 3) from a network that reads views together.
-        codes: (B, V, code_dim) the codes that made them.
-        history: (S + 1, B) consistency loss x100 before the first of S gradient steps and after each; the loss of a
-            shape that has stopped stays what it was. (0, B) when there was nothing to agree on (one view) or nothing
-            to choose (a network without codes).
+        codes: (B, V, code_dim) their codes.
+        history: (S + 1, B) consistency loss x100 before the first of S gradient steps and after each; it stays constant
+            after a shape's descent has stopped. (0, B) for a single view or a network without codes.
         kept: (B,) int64, the step whose codes are returned: a row of `history`, or 0 where that is empty.
     """
 
@@ -48,17 +47,17 @@ def reconstruct(
     step_size: float | None = None,
     settings: InferenceConfig | None = None,
 ) -> Reconstruction:
-    """Searches groups of random codes, keeps each object's most consistent one, descends on its codes.
+    """Draws groups of random codes, keeps each object's most consistent group, and minimises the loss over its codes.
 
     Args:
-        model: a generator; its parameters are left alone. Another method's network, which takes no codes, is just
-            asked.
+        model: the network; its parameters are not changed. One without codes predicts once.
         images: (V, 3, H, W) of one object, or (B, V, 3, H, W) of B objects, in [0, 1] on white.
-        groups: groups of V codes tried per object; 5 if neither this nor `settings` says otherwise.
-        steps: plain gradient steps on the kept codes; 30 likewise.
-        seed: draws the codes.
-        step_size: factor on the gradient of each object's own loss (mean pair chamfer distance x100); 0.5 likewise.
-        settings: all of them and more: stopping early, keeping the best, staying near N(0, 1).
+        groups: number of groups of V random codes per object; by default that of `settings`, or 5.
+        steps: gradient steps on the kept codes; by default those of `settings`, or 30.
+        seed: of the random codes.
+        step_size: factor on the gradient of each object's consistency loss (mean chamfer distance x100 over pairs of
+            views); by default that of `settings`, or 0.5.
+        settings: all of these and more: early stopping, keeping the best codes, regularisation towards N(0, 1).
 
     Raises:
         ValueError: images of another shape, or settings out of range.
@@ -93,7 +92,7 @@ def reconstruct(
     ]
     points, codes, histories, kept = zip(*parts, strict=True)
     rows = max(len(history) for history in histories)
-    history = torch.cat([_prolong(history, rows) for history in histories], dim=1)
+    history = torch.cat([_extend(history, rows) for history in histories], dim=1)
     return Reconstruction(torch.cat(points), torch.cat(codes), history, torch.cat(kept))
 
 
@@ -105,28 +104,22 @@ def _check(settings: InferenceConfig) -> None:
         )
 
 
-def _prolong(history: Tensor, rows: int) -> Tensor:
-    """Repeats the last row of a part that stopped before the others."""
+def _extend(history: Tensor, rows: int) -> Tensor:
+    """Repeats the last row of a group of objects whose descent stopped before that of others."""
     return torch.cat([history, history[-1:].expand(rows - len(history), -1)]) if len(history) else history
 
 
 def _reconstruct(
     model: Predictor, images: Tensor, candidates: Tensor, settings: InferenceConfig
 ) -> Reconstruction:
-    """(B, V, 3, H, W) images and (G, B, V, D) candidates, few enough for memory."""
+    """(B, V, 3, H, W) images and (G, B, V, D) candidate codes, all in memory at once."""
     shapes, views = images.shape[:2]
-    if not isinstance(model, Generator):
-        points = model.answers(images).flatten(1, 2)
-        nothing = torch.zeros(0, shapes)
-        return Reconstruction(points, candidates[0], nothing, torch.zeros(shapes, dtype=torch.int64))
+    if views == 1 or not model.takes_codes:
+        points = model.predict_views(images, candidates[0]).flatten(1, 2)
+        no_history = torch.zeros(0, shapes)
+        return Reconstruction(points, candidates[0], no_history, torch.zeros(shapes, dtype=torch.int64))
     with torch.no_grad():
         features = model.encode(images.flatten(0, 1)).unflatten(0, (shapes, views))
-        if views == 1 or model.config.deterministic:
-            clouds = _decode(model, features, candidates[0])
-            nothing = torch.zeros(0, shapes)
-            return Reconstruction(
-                clouds.flatten(1, 2), candidates[0], nothing, torch.zeros(shapes, dtype=torch.int64)
-            )
         codes = candidates[0]
         if settings.groups > 1:
             scores = [
@@ -136,14 +129,14 @@ def _reconstruct(
     return _descend(model, features, codes, settings)
 
 
-def _decode(model: Generator, features: Tensor, codes: Tensor) -> Tensor:
+def _decode(model: Predictor, features: Tensor, codes: Tensor) -> Tensor:
     """(B, V, C, h, w) features and (B, V, D) codes -> (B, V, N, 3)."""
     clouds = model.decode(features.flatten(0, 1), codes.flatten(0, 1)[None])[0]
     return clouds.unflatten(0, codes.shape[:2])
 
 
-def _descend(model: Generator, features: Tensor, codes: Tensor, settings: InferenceConfig) -> Reconstruction:
-    """Plain gradient descent on (B, V, D) codes; every object has its own loss, so objects do not interact."""
+def _descend(model: Predictor, features: Tensor, codes: Tensor, settings: InferenceConfig) -> Reconstruction:
+    """Gradient descent on (B, V, D) codes; every object has its own loss, so objects do not interact."""
     codes = codes.clone()
     norms = codes.norm(dim=-1, keepdim=True)
     shapes, views = codes.shape[:2]
@@ -155,7 +148,7 @@ def _descend(model: Generator, features: Tensor, codes: Tensor, settings: Infere
     )
     lowest = codes.new_full((shapes,), torch.inf)
     waited = torch.zeros(shapes, dtype=torch.int64)
-    active = torch.arange(shapes)  # shapes whose descent still goes on
+    active = torch.arange(shapes)  # shapes whose descent has not stopped
     for step in range(settings.steps + 1):
         last = step == settings.steps
         moving = codes[active].requires_grad_(not last)

@@ -1,4 +1,4 @@
-"""The paper's figures under names: un-squared distances, x100, each direction a mean over its own set."""
+"""The paper's metrics: un-squared distances x100, each direction a mean over its own set."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from diffpoint import (
 )
 
 FSCORE_DISTANCE = 0.01
-"""World units, that is 1 % of an object's size: how near counts as found."""
+"""Threshold of the F-score in world units: 1 % of an object's size."""
 _EMD_TOLERANCE = 0.02
 
 
 class CloudErrors(NamedTuple):
-    """What separates predictions from ground truth, one value per cloud; distances x100.
+    """Errors of predictions against ground truth, one value per cloud; distances x100.
 
     Attributes:
         gt_to_pred: (*B) mean distance from a true point to the prediction.
         pred_to_gt: (*B) mean distance from a predicted point to the truth.
-        fscore: (*B) harmonic mean of the shares of true and of predicted points with the other cloud within
-            `FSCORE_DISTANCE`, in [0, 1]. Two samplings of one surface reach 1 only if they are as dense as that.
+        fscore: (*B) harmonic mean of precision and recall in [0, 1]: the shares of predicted and of true points within
+            `FSCORE_DISTANCE` of the other cloud. Two samplings of one surface reach 1 only if both are dense enough.
     """
 
     gt_to_pred: Tensor
@@ -56,12 +56,12 @@ def cloud_errors(predicted: Tensor, truth: Tensor) -> CloudErrors:
 
 
 def transport_error(predicted: Tensor, truth: Tensor, *, points: int) -> Tensor:
-    """(*B) mean earth mover's distance x100, within 2 % of the least, between both clouds thinned to equal size.
+    """(*B) mean earth mover's distance x100 between both clouds thinned to equal size, at most 2 % above the optimum.
 
     Args:
         predicted: (*B, N, 3).
         truth: (*B, M, 3).
-        points: to how many points, at most; both clouds are thinned by farthest point sampling.
+        points: number of points, at most, to which both clouds are thinned by farthest point sampling.
     """
     points = min(points, predicted.shape[-2], truth.shape[-2])
     pair = thin_out(predicted, points), thin_out(truth, points)
@@ -69,7 +69,7 @@ def transport_error(predicted: Tensor, truth: Tensor, *, points: int) -> Tensor:
 
 
 def thin_out(clouds: Tensor, count: int) -> Tensor:
-    """(*B, N, 3) -> (*B, count, 3) by farthest point sampling, so that more views do not mean more points."""
+    """(*B, N, 3) -> (*B, count, 3) by farthest point sampling, for comparisons at an equal number of points."""
     if clouds.shape[-2] <= count:
         return clouds
     index = farthest_point_sample(clouds, count)
@@ -77,10 +77,9 @@ def thin_out(clouds: Tensor, count: int) -> Tensor:
 
 
 def visible_error(points: Tensor, camera: PinholeCamera, depth: Tensor) -> Tensor:
-    """(B, V) chamfer distance x100 between what views see of clouds and what they saw of the shapes.
+    """(B, V) chamfer distance x100 between the points visible in each view and its depth map: the front constraint.
 
-    It is the front constraint, as a measure for clouds of whatever origin. Where a view sees nothing of a cloud, the
-    whole cloud is compared.
+    Where no point is visible in a view, the whole cloud is compared.
 
     Args:
         points: (B, N, 3) in the world.
@@ -93,7 +92,7 @@ def visible_error(points: Tensor, camera: PinholeCamera, depth: Tensor) -> Tenso
 
 
 def in_silhouette(points: Tensor, camera: PinholeCamera, depth: Tensor, *, margin: int = 0) -> Tensor:
-    """(B, V, N): does the point project into a pixel where the shape is, or `margin` pixels beside one?
+    """(B, V, N) bool: whether a point projects into the shape's silhouette, dilated by `margin` pixels.
 
     Args: as `visible_error`.
     """

@@ -1,4 +1,4 @@
-"""One split scored with one number of views and one seed: a value per shape for every figure."""
+"""Per-shape metrics: one split evaluated with one number of views and one seed, a value per shape for every metric."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ import torch
 from torch import Tensor
 
 from diffpoint import chamfer_distance, consistency_loss
-from models import Generator, Predictor
+from models import Predictor
 from train.config import InferenceConfig
 from train.data.batches import Batch, LoadedSplit
-from train.errors import UserError
 from train.evaluation.inference import reconstruct
 from train.evaluation.metrics import cloud_errors, thin_out, transport_error
 
-FIGURES = (
+METRICS = (
     "gt_to_pred",
     "pred_to_gt",
     "cd",
@@ -26,15 +25,16 @@ FIGURES = (
     "fscore_01",
     "emd",
 )
-"""What is known of a reconstruction beside the truth. Distances x100, un-squared; fscore_01 in [0, 1]."""
+"""Metrics of a reconstruction. Un-squared distances x100; fscore_01 in [0, 1]. "fps_": after predictions are thinned to
+the size of one by farthest point sampling. "consistency": between the views' predictions, see `reconstruct`."""
 
 SHAPES_AT_ONCE = 16
 
-Scores = dict[str, Tensor]
-"""Figure -> one value per shape (M,), or per seed and shape (S, M). A figure that does not apply is absent."""
+ShapeMetrics = dict[str, Tensor]
+"""Metric -> one value per shape (M,), or per seed and shape (S, M). A metric that is not defined is absent."""
 
 
-def score(
+def evaluate_split(
     model: Predictor,
     test: LoadedSplit,
     settings: InferenceConfig,
@@ -43,63 +43,56 @@ def score(
     seed: int,
     code_seed: int | None = None,
     done: Callable[[int], object] = lambda count: None,
-) -> Scores:
-    """Reconstructs every shape of a split from `views` of its views and compares it with the truth.
+) -> ShapeMetrics:
+    """Reconstructs every shape of a split from `views` of its views and compares it with the ground truth.
 
     Args:
-        model: a generator, or another method's network.
+        model: the network.
         test: the split.
-        settings: search and descent; one group and no steps are random codes. With `scored="each"` the figures are
-            means over the views' predictions, and "best_cd" is the best one's chamfer distance.
-        views: how many views each shape shows; which ones, the seed decides, and fewer are the first of more.
-        seed: draws views and codes.
-        code_seed: draws the codes in place of `seed`.
-        done: told how many shapes have just been scored.
+        settings: search and descent on the codes; one group and no steps are random codes. With `scored="each"` the
+            metrics are means over the views' own predictions, and "best_cd" is the smallest of their chamfer distances.
+        views: number of input views; the seed determines which, and fewer are the first of more.
+        seed: of the choice of views and of the codes.
+        code_seed: of the codes, in place of `seed`.
+        done: called with the number of shapes that have just been evaluated.
 
     Returns:
-        The figures of `FIGURES`; "code_norm", the mean length of the codes; and where codes were sought "searched",
-        the consistency loss x100 before the descent.
+        The metrics of `METRICS`; "code_norm", the mean norm of the codes; and after a search "searched", the
+        consistency loss x100 before the descent.
     """
-    parts: list[Scores] = []
+    parts: list[ShapeMetrics] = []
     order = view_order(test, seed)
     draw = seed if code_seed is None else code_seed
     for start in range(0, len(test), SHAPES_AT_ONCE):
         shapes = torch.arange(start, min(start + SHAPES_AT_ONCE, len(test)))
         images, truth = test.float_images(shapes, order[shapes, :views]), test.points[shapes]
         found = reconstruct(model, images, seed=draw * 10_000 + start, settings=settings)
-        each = _predictions(model, found.points, views)
-        if settings.scored == "each" and each is not None:
-            by_view = compare(each, truth[:, None].expand(-1, views, -1, -1), points=model.points)
-            scores = {name: values.mean(1) for name, values in by_view.items()}
-            scores["best_cd"] = by_view["cd"].amin(1)
+        by_view = None if model.reads_views_together else found.points.unflatten(1, (views, -1))
+        if settings.scored == "each" and by_view is not None:
+            each = compare_clouds(by_view, truth[:, None].expand(-1, views, -1, -1), points=model.points)
+            metrics = {name: values.mean(1) for name, values in each.items()}
+            metrics["best_cd"] = each["cd"].amin(1)
         else:
-            scores = compare(found.points, truth, points=model.points)
-        scores["code_norm"] = found.codes.norm(dim=-1).mean(1)
+            metrics = compare_clouds(found.points, truth, points=model.points)
+        metrics["code_norm"] = found.codes.norm(dim=-1).mean(1)
         if len(found.history):
-            scores["searched"] = found.history[0]
-            scores["consistency"] = found.history.gather(0, found.kept[None])[0]
-        elif views > 1 and each is not None:
-            scores["consistency"] = 100 * consistency_loss(each, reduction="none")
-        parts.append(scores)
+            metrics["searched"] = found.history[0]
+            metrics["consistency"] = found.history.gather(0, found.kept[None])[0]
+        elif views > 1 and by_view is not None:
+            metrics["consistency"] = 100 * consistency_loss(by_view, reduction="none")
+        parts.append(metrics)
         done(len(shapes))
-    return joined(parts)
+    return concatenate(parts)
 
 
-def _predictions(model: Predictor, points: Tensor, views: int) -> Tensor | None:
-    """Every view's own cloud in a reconstruction (B, V*N, 3): (B, V, N, 3); None where views are read together."""
-    if not isinstance(model, Generator) and model.reads_views_together:
-        return None
-    return points.unflatten(1, (views, -1))
-
-
-def compare(predicted: Tensor, truth: Tensor, *, points: int) -> Scores:
-    """Clouds (*B, N, 3) beside clouds (*B, M, 3).
+def compare_clouds(predicted: Tensor, truth: Tensor, *, points: int) -> ShapeMetrics:
+    """Metrics of clouds (*B, N, 3) against ground truth (*B, M, 3), each (*B).
 
     Args:
-        predicted: the joined predictions.
-        truth: what they should be.
-        points: size of one prediction, to which the joined ones are thinned for the fps_ figures; for the earth
-            mover's distance both clouds are.
+        predicted: the predictions, concatenated over views.
+        truth: the ground truth.
+        points: size of one prediction, to which predictions are thinned for the fps_ metrics, and both clouds for the
+            earth mover's distance.
     """
     errors, thinned = cloud_errors(predicted, truth), cloud_errors(thin_out(predicted, points), truth)
     return {
@@ -115,26 +108,20 @@ def compare(predicted: Tensor, truth: Tensor, *, points: int) -> Scores:
 
 
 @torch.no_grad()
-def answers(
+def sample_predictions(
     model: Predictor, test: LoadedSplit, *, codes: int, seed: int
 ) -> Iterator[tuple[Tensor, Batch, Tensor]]:
-    """What a network makes of one image of each shape with several random codes, some shapes at a time.
+    """Predictions from one image of each shape with several random codes, for some shapes at a time.
 
     Args:
-        model: takes codes.
-        test: the split whose images are shown.
-        codes: how many, R.
-        seed: draws views and codes.
+        model: the network; the R predictions are equal if it takes no codes.
+        test: the split with the images.
+        codes: number R of codes per image.
+        seed: of the choice of views and of the codes.
 
     Yields:
-        (B,) numbers of shapes, their batch with the one view that is shown, and (R, B, N, 3) predictions in the world
-        frame.
-
-    Raises:
-        UserError: the network takes no codes.
+        (B,) indices of shapes, their batch with the one input view, and (R, B, N, 3) predictions in the world frame.
     """
-    if not isinstance(model, Generator):
-        raise UserError("several answers to one image come from a network with codes; this one has none")
     generator = torch.Generator().manual_seed(seed)
     for shapes, shown in one_view_each(test, seed):
         drawn = torch.randn(codes, len(shapes), model.code_dim, generator=generator)
@@ -142,21 +129,21 @@ def answers(
 
 
 def one_view_each(test: LoadedSplit, seed: int) -> Iterator[tuple[Tensor, Batch]]:
-    """Every shape with the first view of a seed's order, some at a time: (B,) shape numbers, and their batch."""
+    """Every shape with the first view of a seed's order, some at a time: (B,) shape indices, and their batch."""
     first = view_order(test, seed)[:, :1]
     for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
         yield shapes, test.batch(shapes, first[shapes])
 
 
-def distance_between(answers: Tensor) -> Tensor:
-    """(R, B, N, 3) several predictions of each image -> (B,) mean chamfer distance x100 between any two of them."""
-    return 100 * consistency_loss(answers.transpose(0, 1), reduction="none")
+def pairwise_distance(predictions: Tensor) -> Tensor:
+    """(R, B, N, 3) several predictions from each image -> (B,) mean chamfer distance x100 over all pairs of them."""
+    return 100 * consistency_loss(predictions.transpose(0, 1), reduction="none")
 
 
 def diversity(model: Predictor, test: LoadedSplit, *, codes: int, seed: int) -> Tensor:
-    """(M,) `distance_between` the predictions of one image with `codes` random codes."""
-    found = answers(model, test, codes=codes, seed=seed)
-    return torch.cat([distance_between(clouds) for _, _, clouds in found])
+    """(M,) `pairwise_distance` of the predictions from one image of each shape with `codes` random codes."""
+    sampled = sample_predictions(model, test, codes=codes, seed=seed)
+    return torch.cat([pairwise_distance(predictions) for _, _, predictions in sampled])
 
 
 def distance_to_nearest(clouds: Tensor, among: Tensor) -> Tensor:
@@ -170,38 +157,40 @@ def distance_to_nearest(clouds: Tensor, among: Tensor) -> Tensor:
 
 
 def view_order(test: LoadedSplit, seed: int) -> Tensor:
-    """(M, V): for each shape its views in this seed's order."""
+    """(M, V): for each shape a random permutation of its views."""
     generator = torch.Generator().manual_seed(seed)
     return torch.stack([torch.randperm(test.views, generator=generator) for _ in range(len(test))])
 
 
-def joined(parts: Sequence[Scores]) -> Scores:
-    """The scores of some shapes after those of others, (M,); or of some seeds, (S, M)."""
+def concatenate(parts: Sequence[ShapeMetrics]) -> ShapeMetrics:
+    """Joins the metrics of several groups of shapes, (M,), or of seeds, (S, M), along the first axis."""
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
-def stacked(by_seed: Sequence[Scores]) -> Scores:
-    """The scores of several seeds as one, (S, M)."""
-    return {name: torch.stack([scores[name] for scores in by_seed]) for name in by_seed[0]}
+def stack_seeds(by_seed: Sequence[ShapeMetrics]) -> ShapeMetrics:
+    """The metrics (M,) of several seeds as one, (S, M)."""
+    return {name: torch.stack([metrics[name] for metrics in by_seed]) for name in by_seed[0]}
 
 
-def means(scores: Scores, shapes: Tensor | slice = slice(None)) -> dict[str, float | None]:
-    """Every figure's mean over seeds and some shapes; None for one that does not apply."""
+def mean_metrics(metrics: ShapeMetrics, shapes: Tensor | slice = slice(None)) -> dict[str, float | None]:
+    """Every metric's mean over seeds and the given shapes, of metrics (S, M); None for one that is not defined."""
     return {
-        name: scores[name][:, shapes].double().mean().item() if name in scores else None for name in FIGURES
+        name: metrics[name][:, shapes].double().mean().item() if name in metrics else None for name in METRICS
     }
 
 
-def spreads(scores: Scores) -> dict[str, float | None]:
-    """Every figure's standard deviation over seeds of the mean over shapes; None for a single seed."""
+def std_over_seeds(metrics: ShapeMetrics) -> dict[str, float | None]:
+    """Standard deviation over seeds of every metric's mean over shapes, of metrics (S, M); None for a single seed."""
     return {
-        name: scores[name].double().mean(1).std().item() if name in scores and len(scores[name]) > 1 else None
-        for name in FIGURES
+        name: metrics[name].double().mean(1).std().item()
+        if name in metrics and len(metrics[name]) > 1
+        else None
+        for name in METRICS
     }
 
 
-def average(rows: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
-    """The mean of several rows of figures, each counting once."""
+def average_rows(rows: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
+    """The unweighted mean of several rows of metrics; None values are left out."""
 
     def mean(values: list[float | None]) -> float | None:
         known = [value for value in values if value is not None]

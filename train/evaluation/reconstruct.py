@@ -1,4 +1,4 @@
-"""The `reconstruct` command: pictures in, a point cloud and a page to look at out."""
+"""The `reconstruct` command: images in, a point cloud (PLY) and an HTML page out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffpoint.io import write_points
-from train.data.choy import pictures_of
+from train.data.choy_layout import pictures_of
 from train.data.cutout import cut_out
 from train.data.images import is_cut_out, read_images, read_rgba
 from train.errors import UserError
@@ -23,9 +23,9 @@ _ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 
 def reconstruct_to_files(
-    run: Path,
-    images: Sequence[Path],
-    out: Path,
+    run: str | Path,
+    images: Sequence[str | Path],
+    out: str | Path,
     *,
     groups: int | None = None,
     steps: int | None = None,
@@ -33,14 +33,23 @@ def reconstruct_to_files(
 ) -> None:
     """Reconstructs one object and writes reconstruction.ply and reconstruction.html into `out`.
 
-    Everything is read and computed before anything is written. `groups` and `steps` are the run's if not given.
+    Nothing is written before everything is computed.
+
+    Args:
+        run: a run's directory, a .safetensors file of one, or "pretrained".
+        images: 1 to 24 images of the object, or folders of them.
+        out: directory to write to.
+        groups: groups of random codes in the search; by default the run's setting.
+        steps: gradient steps on the codes; by default the run's setting.
+        seed: of the random codes.
 
     Raises:
-        UserError: a run that is no run, an image that is no image, or a wrong number of either.
+        UserError: not a run, not an image, or a number out of range.
     """
     from train.show.pages import write_reconstruction_page
 
-    images = named_pictures(images)
+    out = Path(out)
+    images = image_files(images)
     if not 1 <= len(images) <= MOST_IMAGES:
         raise UserError(f"reconstruct takes 1 to {MOST_IMAGES} images; got {len(images)}")
     if out.exists() and not out.is_dir():
@@ -62,14 +71,14 @@ def reconstruct_to_files(
     print(f"wrote {out}/reconstruction.ply and {out}/reconstruction.html: {made}")
 
 
-def named_pictures(paths: Sequence[Path]) -> list[Path]:
-    """The pictures that were named; a folder stands for those in it, a model of Choy's renderings for its views.
+def image_files(paths: Sequence[str | Path]) -> list[Path]:
+    """The given image files; a folder is replaced by the images in it, a model of Choy's renderings by its views.
 
     Raises:
-        UserError: a folder without pictures.
+        UserError: a folder without images.
     """
     found: list[Path] = []
-    for path in paths:
+    for path in map(Path, paths):
         if not path.is_dir():
             found.append(path)
             continue
@@ -82,13 +91,13 @@ def named_pictures(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-def read_pictures(paths: Sequence[Path]) -> Tensor:
-    """(V, 3, 224, 224) in [0, 1]: cut-outs as they are, photographs with a plain background cut out.
+def read_pictures(paths: Sequence[str | Path]) -> Tensor:
+    """(V, 3, 224, 224) in [0, 1]: objects on white; photographs with a plain background are cut out.
 
-    A picture with transparency or a purely white border is a cut-out; its scale is kept.
+    An image with transparency or a purely white border counts as cut out already; its scale is kept.
     """
     pictures = []
-    for path in paths:
+    for path in map(Path, paths):
         rgba = read_rgba(path)
         picture = read_images([path])
         if not is_cut_out(rgba):

@@ -1,5 +1,4 @@
-"""Two answers without a network, which any trained one must beat: the medoid, and the nearest shape by
-image."""
+"""Two retrieval baselines, which need no network: the medoid of the training shapes, and the nearest by image."""
 
 from __future__ import annotations
 
@@ -13,42 +12,49 @@ from train.data.batches import LoadedSplit
 
 _MEDOID_SHAPES = 1000
 _MEDOID_POINTS = 256
+_CHUNK_BYTES = 2**28  # of training images as float32 at a time; all of them can be tens of gigabytes
 
 
 def medoid(points: Tensor) -> int:
-    """Number of the cloud with the smallest mean chamfer distance to all others.
+    """Index of the cloud with the smallest mean chamfer distance to all others.
 
     Args:
         points: (M, P, 3). At most 1000 clouds, spread evenly, are compared, each by 256 of its points.
     """
     stride = max(1, points.shape[1] // _MEDOID_POINTS)
-    numbers = torch.arange(len(points))
+    index = torch.arange(len(points))
     if len(points) > _MEDOID_SHAPES:
-        numbers = torch.linspace(0, len(points) - 1, _MEDOID_SHAPES).long()
-    thin = points[numbers, ::stride].contiguous()
-    totals = torch.zeros(len(numbers))
-    for row in range(len(numbers)):
+        index = torch.linspace(0, len(points) - 1, _MEDOID_SHAPES).long()
+    thin = points[index, ::stride].contiguous()
+    totals = torch.zeros(len(index))
+    for row in range(len(index)):
         distance = chamfer_distance(thin[row].expand_as(thin).contiguous(), thin, squared=False)
         totals[row] = (distance.a_to_b + distance.b_to_a).sum()
-    return int(numbers[totals.argmin()])
+    return int(index[totals.argmin()])
 
 
 def nearest_by_image(test: LoadedSplit, train: LoadedSplit, *, views: Sequence[int]) -> dict[int, Tensor]:
-    """For each number of views, the training shape whose renders look most like each test shape's images.
+    """For each number of views n, the training shape whose images are nearest to those of each test shape.
 
     The distance of a test shape to a training shape is the sum over the test shape's first n images of the
-    smallest L2 distance to any image of the training shape.
+    smallest L2 distance to any image of the training shape. Memory does not grow with the number of training shapes.
 
     Returns:
-        For each n of `views`, (M_test,) numbers of training shapes.
+        For each n of `views`, (M_test,) indices of training shapes; of equally near ones the first.
     """
-    known = torch.stack(tuple(train.images)).flatten(2).flatten(0, 1).float() / 255
-    known_squared = known.square().sum(1)
-    smallest = []
-    for images in test.images:
-        seen = images.flatten(1).float() / 255
-        squared = seen.square().sum(1)[:, None] + known_squared - 2 * seen @ known.T
-        distance = squared.clamp(min=0).sqrt().unflatten(1, (len(train), train.views))
-        smallest.append(distance.amin(2))
-    by_view = torch.stack(smallest)
-    return {n: by_view[:, :n].sum(1).argmin(1) for n in views}
+    smallest = {n: torch.full((len(test),), torch.inf) for n in views}
+    nearest = {n: torch.zeros(len(test), dtype=torch.int64) for n in views}
+    chunk = max(1, _CHUNK_BYTES // (4 * train.images[0].numel()))
+    for first in range(0, len(train), chunk):
+        shapes = range(first, min(first + chunk, len(train)))
+        known = torch.cat([train.images[shape] for shape in shapes]).flatten(1).float() / 255
+        known_squared = known.square().sum(1)
+        for row, images in enumerate(test.images):
+            seen = images.flatten(1).float() / 255
+            squared = seen.square().sum(1)[:, None] + known_squared - 2 * seen @ known.T
+            distance = squared.clamp(min=0).sqrt().unflatten(1, (len(shapes), -1)).amin(2)
+            for n in views:
+                least, which = distance[:n].sum(0).min(0)
+                if least < smallest[n][row]:
+                    smallest[n][row], nearest[n][row] = least, first + which
+    return nearest

@@ -1,28 +1,25 @@
-"""What a user may name as a run: a directory of `fit`, a file of weights, or the word `pretrained`."""
+"""Trained runs on disk: a directory written by `fit`, a file of weights, or "pretrained" for the shipped weights."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
 from models import Autoencoder, Generator, Predictor
-from train.config import PROFILES, FitConfig, fit_config_from_json
+from train.config import FitConfig, fit_config_from_json
 from train.data.batches import LoadedSplit, load_split
 from train.errors import UserError
-from train.methods.recipes import with_system
-from train.methods.systems import system_of
-from train.methods.weights import PREDICTORS, read_weights
+from train.methods.weights import method_of, predictor_classes, read_weights
 
 PRETRAINED = "pretrained"
-"""The word for the weights that come with the repository; a file or directory of that name goes first."""
+"""Names the weights that come with the repository, unless there is a file or directory of that name."""
 _SHIPPED = Path(__file__).parents[1] / "pretrained"
 
 
 class OpenRun(NamedTuple):
-    """A trained network, how it was trained, and the directory where what is found out about it belongs.
+    """A trained network, its training's configuration, and the directory for results about it.
 
     `folder` is None for the weights that come with the repository.
     """
@@ -33,29 +30,30 @@ class OpenRun(NamedTuple):
 
     def load_split(
         self,
-        data: Path,
+        data: str | Path,
         split: Literal["train", "val", "test"],
         *,
         limit: int | None = None,
         progress: bool = True,
     ) -> LoadedSplit:
-        """Reads a split as the run was trained: its image and map sizes, its categories."""
+        """Loads a split with the run's image size, map size and categories."""
         size = (self.model.config.image_height, self.model.config.image_width)
         return read_split(self.config, data, split, image_size=size, limit=limit, progress=progress)
 
 
 def read_split(
     config: FitConfig,
-    data: Path | Sequence[Path],
+    data: str | Path | Sequence[str | Path],
     split: Literal["train", "val", "test"],
     *,
     image_size: tuple[int, int],
     limit: int | None = None,
     progress: bool = True,
 ) -> LoadedSplit:
-    """Reads a split as a configuration asks for it: its map size and pooling, its categories; see `load_split`."""
+    """Loads a split with a configuration's map size, pooling and categories; see `load_split`."""
+    roots = [data] if isinstance(data, (str, Path)) else data
     return load_split(
-        data,
+        [Path(root) for root in roots],
         split,
         image_size=image_size,
         map_size=config.map_size,
@@ -66,77 +64,83 @@ def read_split(
     )
 
 
-def open_run(run: Path) -> OpenRun:
-    """Loads the network of a run.
+def open_run(run: str | Path) -> OpenRun:
+    """Loads the network of a run with its configuration.
 
     Args:
-        run: a run's directory, a .safetensors file of one, or `Path("pretrained")`.
+        run: a run's directory, a .safetensors file of one, or "pretrained".
 
     Raises:
-        UserError: there is nothing of the kind, or it cannot be read.
+        UserError: no such run, or it cannot be read.
     """
-    if run != Path(PRETRAINED) or run.exists():
-        model = load_predictor(run)
-        return OpenRun(model, config_of(run, model), run if run.is_dir() else run.parent)
-    weights = _SHIPPED / "generator.safetensors"
-    if not weights.exists():
-        raise UserError(
-            f"'{PRETRAINED}' means the weights in {weights}, and there are none; train your own "
-            "(python -m train data procedural --out data --shapes 400 --size 112, then python -m train fit "
-            "--data data --out run, about an hour) and name that run instead"
-        )
-    model = load_predictor(weights)
-    return OpenRun(model, config_of(_SHIPPED, model), None)
+    path = Path(run)
+    model = load_predictor(path)
+    if _is_shipped(path):
+        return OpenRun(model, config_of(_SHIPPED, model), None)
+    return OpenRun(model, config_of(path, model), path if path.is_dir() else path.parent)
 
 
-def best_weights(run: Path, phase: int | str) -> Path:
-    """Where a phase ("autoencoder", stage 1 or 2) keeps its best weights by validation."""
+def best_weights(run: str | Path, phase: int | str) -> Path:
+    """The file with a phase's best weights by validation; the phase is "autoencoder" or the number of a stage."""
     name = f"stage{phase}" if isinstance(phase, int) else phase
-    return run / "checkpoints" / f"best-{name}.safetensors"
+    return Path(run) / "checkpoints" / f"best-{name}.safetensors"
 
 
 def load_generator(run_or_file: str | Path) -> Generator:
-    """Loads the generator of a run (best of stage 2, else of stage 1, else the newest) or of a file.
+    """Loads the generator of a run (best weights of stage 2, else of stage 1, else the newest checkpoint).
+
+    Args:
+        run_or_file: a run's directory, a .safetensors file of one, or "pretrained".
 
     Returns:
         The generator in eval mode.
 
     Raises:
-        UserError: there is nothing of the kind, or it cannot be read.
+        UserError: no such run, one of a baseline, or it cannot be read.
     """
-    path = Path(run_or_file)
-    return read_weights(_weights_of_run(path) if path.is_dir() else path, Generator).eval()
+    return read_weights(_weights_file(Path(run_or_file)), Generator).eval()
 
 
 def load_predictor(run_or_file: str | Path) -> Predictor:
-    """As `load_generator`, of any system: the network of a run, or of a file, whatever it is.
-
-    Raises:
-        UserError: there is nothing of the kind, or it cannot be read.
-    """
-    path = Path(run_or_file)
-    return cast(Predictor, read_weights(_weights_of_run(path) if path.is_dir() else path, *PREDICTORS)).eval()
+    """As `load_generator`, for the network of any system."""
+    return read_weights(_weights_file(Path(run_or_file)), *predictor_classes()).eval()
 
 
 def load_autoencoder(run_or_file: str | Path) -> Autoencoder:
     """Loads the best auto-encoder of a run, or that of a file, in eval mode and frozen.
 
     Raises:
-        UserError: there is nothing of the kind, or it cannot be read.
+        UserError: no such file, or it cannot be read.
     """
     path = Path(run_or_file)
     return read_weights(best_weights(path, "autoencoder") if path.is_dir() else path, Autoencoder).freeze()
 
 
 def config_of(run_or_file: str | Path, model: Predictor) -> FitConfig:
-    """The configuration of a run, or for a lone file of weights that of its profile and system."""
+    """The configuration of a run; for a file of weights the default of its profile and system."""
     file = Path(run_or_file) / "config.json"
     if file.exists():
         return fit_config_from_json(file.read_text(), where=str(file))
-    profile = PROFILES[model.profile]
-    if not isinstance(model, Generator):
-        return with_system(profile, system_of(model))
-    return dataclasses.replace(profile, deterministic=model.config.deterministic)
+    return method_of(model).recipe_of(model)
+
+
+def _is_shipped(path: Path) -> bool:
+    return path == Path(PRETRAINED) and not path.exists()
+
+
+def _weights_file(path: Path) -> Path:
+    if path.is_dir():
+        return _weights_of_run(path)
+    if not _is_shipped(path):
+        return path
+    weights = _SHIPPED / "generator.safetensors"
+    if not weights.exists():
+        raise UserError(
+            f"'{PRETRAINED}' means the weights in {weights}, which does not exist; train your own "
+            "(python -m train data procedural --out data --shapes 400 --size 112, then python -m train fit "
+            "--data data --out run, about an hour) and name that run instead"
+        )
+    return weights
 
 
 def _weights_of_run(run: Path) -> Path:
@@ -153,23 +157,24 @@ def _weights_of_run(run: Path) -> Path:
     )
 
 
-def latest_checkpoint(run: Path) -> Path | None:
+def latest_checkpoint(run: str | Path) -> Path | None:
     """The newest complete checkpoint of a run, or None."""
     found = checkpoints(run)
     return found[-1] if found else None
 
 
-def checkpoints(run: Path) -> list[Path]:
-    return sorted((run / "checkpoints").glob("step-????????"))
+def checkpoints(run: str | Path) -> list[Path]:
+    """All complete checkpoints of a run, oldest first."""
+    return sorted((Path(run) / "checkpoints").glob("step-????????"))
 
 
-def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """All records of a run, in order."""
-    return [json.loads(line) for line in complete_lines(run / "metrics.jsonl")]
+def read_metrics(run: str | Path) -> list[dict[str, Any]]:
+    """All records of a run's metrics.jsonl, in order."""
+    return [json.loads(line) for line in complete_lines(Path(run) / "metrics.jsonl")]
 
 
 def complete_lines(path: Path) -> list[str]:
-    """The lines of a file; one cut short by a kill is left out."""
+    """The lines of a file without an incomplete last one, which a killed process leaves; none without the file."""
     if not path.exists():
         return []
     return [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]

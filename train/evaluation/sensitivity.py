@@ -1,7 +1,7 @@
-"""Whether a network in training still listens: to the image, to the code, and with how much of its trunk.
+"""Collapse check: how much predictions change with the image and with the code, and how much of the trunk is dead.
 
-The loss does not tell: a generator whose image trunk has died fits the data's mean shape, and its loss still
-falls.
+The loss does not show a collapse: a generator whose image trunk has died fits the mean shape of the data, and its loss
+still falls.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import torch
 from torch import Tensor
 
 from diffpoint import chamfer_distance
-from models import Generator, Predictor
+from models import Predictor
 
 
 class Sensitivity(NamedTuple):
     """Mean chamfer distance x100 (both directions) between pairs of predictions.
 
     Attributes:
-        image: of different images at one code.
-        code: of different codes at one image.
-        dead_share: share of the trunk's output channels that are zero on every image and at every place; 0 for other
-            methods' networks.
+        image: of different images and the same code.
+        code: of the same image and different codes.
+        dead_share: share of the trunk's output channels that are zero at every place of every image; see
+            `Predictor.dead_share`.
     """
 
     image: float
@@ -32,27 +32,22 @@ class Sensitivity(NamedTuple):
 
 @torch.no_grad()
 def sensitivity(model: Predictor, images: Tensor, *, seed: int = 0) -> Sensitivity:
-    """Measures how far predictions move with the image and with the code.
+    """Measures how much predictions change with the image and with the code.
 
     Args:
-        model: a generator, or another method's network.
+        model: the network.
         images: (B, 3, H, W) of B >= 2 different shapes, in [0, 1].
-        seed: draws the two codes that are used.
+        seed: of the two codes.
     """
     if len(images) < 2:
         raise ValueError(f"sensitivity: needs at least 2 images, got {len(images)}")
     codes = torch.randn(2, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
-    codes, dead_share = codes.expand(2, len(images), -1), 0.0
-    if isinstance(model, Generator):
-        features = model.encode(images)
-        clouds = model.decode(features, codes)
-        dead_share = (features.amax((0, 2, 3)) <= 0).float().mean().item()
-    else:
-        clouds = model(images, codes)
+    features = model.encode(images)
+    clouds = model.decode(features, codes.expand(2, len(images), -1))
     return Sensitivity(
         image=_mean_cd100(clouds[0], clouds[0].roll(1, 0)),
         code=_mean_cd100(clouds[0], clouds[1]),
-        dead_share=dead_share,
+        dead_share=model.dead_share(features),
     )
 
 

@@ -27,7 +27,7 @@ from models import Predictor
 from train.config import FitConfig, InferenceConfig
 from train.data.batches import LoadedSplit
 from train.errors import UserError
-from train.evaluation.per_shape import FIGURES, score
+from train.evaluation.per_shape import METRICS, evaluate_split
 from train.evaluation.runs import open_run
 from train.experiments.correlation import pearson
 from train.experiments.frame import Experiment, Outcome
@@ -78,7 +78,7 @@ def make(study: Study) -> Outcome:
     run = study.train(_config(study)) if study.run is None else study.run
     opened = open_run(run)
     model, config, views = opened.model, opened.config, study.views
-    if not _takes_codes(model):
+    if not model.takes_codes:
         raise UserError(f"{run} takes no codes: there are none to search for")
     test = study.split(config, "test")
     if not 2 <= views <= test.views:
@@ -138,7 +138,8 @@ def _measured(study: Study, run: Path, what: _Measurement) -> Metrics:
 
     def measure() -> Metrics:
         draws = [
-            score(opened.model, test, settings, views=views, seed=seed, code_seed=draw) for draw in code_seeds
+            evaluate_split(opened.model, test, settings, views=views, seed=seed, code_seed=draw)
+            for draw in code_seeds
         ]
         return {name: torch.stack([draw[name] for draw in draws]) for name in draws[0]}
 
@@ -171,7 +172,7 @@ def _summary(
     found: Mapping[str, np.ndarray], random: Mapping[str, np.ndarray], settings: InferenceConfig
 ) -> dict:
     """A setting's means, their spread over draws, and the change against random codes with its standard error."""
-    by_draw = spreads({name: found[name] for name in FIGURES if name in found})
+    by_draw = spreads({name: found[name] for name in METRICS if name in found})
     changes = {name: (found[name] - random[name]).mean(0) for name in _COLUMNS}
     return {
         "settings": dataclasses.asdict(settings),

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from models import Generator
 from models.parts import IMAGE_GAIN, IMAGE_MEAN
-from train.config import PROFILES, FitConfig
+from train.config import FitConfig
 from train.data.batches import LoadedSplit
 from train.errors import UserError
 from train.evaluation.runs import read_split
@@ -31,9 +31,9 @@ from train.experiments.markdown import table_lines
 from train.experiments.paper import without_critic
 from train.experiments.study import Study, stage1_of
 from train.files import kept
-from train.methods.systems import image_size
+from train.methods import get_method, recipe
 from train.show import figures
-from train.training.state import Training
+from train.training.trainer import Trainer
 from train.training.validation import validate
 
 STEPS = 500
@@ -139,7 +139,8 @@ def _curve(study: Study, root: Path, name: str, seed: int) -> Curve:
     """The measurements of one training, made now or kept."""
     config = _config(study, name, seed)
     key = [name, dataclasses.replace(study, data=(root,)).run_of(config).name]
-    read = functools.partial(read_split, config, root, image_size=image_size(config), progress=False)
+    size = get_method(config.system).image_size(config)
+    read = functools.partial(read_split, config, root, image_size=size, progress=False)
     return kept(
         _kept_at(study, root, name, seed),
         key,
@@ -149,24 +150,25 @@ def _curve(study: Study, root: Path, name: str, seed: int) -> Curve:
 
 def _train(config: FitConfig, variant: Variant, train: LoadedSplit, val: LoadedSplit) -> Curve:
     """Trains stage 1 step by step, from the variant's network."""
-    training = Training(config, train)
-    generator = training.learner.generator
+    trainer = Trainer(config, train)
+    generator = trainer.state.network
+    assert isinstance(generator, Generator)
     for change in variant.network:
         change(generator)
     shapes = torch.arange(min(_IMAGES, len(val)))
     images = val.float_images(shapes, torch.zeros(len(shapes), 1, dtype=torch.long))[:, 0]
     found: Curve = []
-    every = max(1, training.phase.steps // _MEASUREMENTS)
-    while not training.done:
+    every = max(1, trainer.phase.steps // _MEASUREMENTS)
+    while not trainer.done:
         try:
-            report = training.advance()
+            report = trainer.train_step()
         except UserError:  # the loss is no longer finite: that is a result too
-            found.append({"step": training.step, "image": math.nan, "code": math.nan, "dead_share": math.nan})
+            found.append({"step": trainer.step, "image": math.nan, "code": math.nan, "dead_share": math.nan})
             break
-        if training.step % every == 0 or training.done:
+        if trainer.step % every == 0 or trainer.done:
             now = sensitivity(generator, images, seed=config.seed)
             moved = {
-                "step": training.step,
+                "step": trainer.step,
                 "image": now.image,
                 "code": now.code,
                 "dead_share": now.dead_share,
@@ -204,7 +206,7 @@ def _figure(result: Mapping[str, Any]) -> Figure:
     trees = result["curves"]
     figure = Figure(figsize=(6.5 * len(trees) + 2, 4.4), layout="constrained", dpi=110)
     panels = figure.subplots(1, len(trees), squeeze=False)[0]
-    stopped = PROFILES[result["profile"]].min_image_sensitivity
+    stopped = recipe("ours", result["profile"]).min_image_sensitivity
     for axes, (tree, rows) in zip(panels, trees.items(), strict=True):
         for (name, runs), colour in zip(rows.items(), _COLOURS, strict=False):
             for number, run in enumerate(runs):

@@ -20,11 +20,11 @@ from tqdm import tqdm
 from diffpoint import PinholeCamera, nearest
 from models import Predictor
 from train.config import FitConfig
-from train.data import ShapeTree, store
+from train.data import ShapeTree, tree_files
+from train.data.ambiguity_check import AmbiguousObject, ambiguous_object
 from train.data.families import FAMILIES
 from train.data.procedural import variants_of
 from train.data.render import Renderer, orbit_camera
-from train.data.rules import Hider, hider_of
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
 from train.experiments.frame import Experiment, Outcome
@@ -103,7 +103,7 @@ def make(study: Study) -> Outcome:
     """
     study.train_all(configs(study))
     config = study.config(unchanged, seed=0)
-    hiders = [found for found in map(hider_of, study.split(config, "test").ids) if found]
+    hiders = [found for found in map(ambiguous_object, study.split(config, "test").ids) if found]
     if not hiders:
         raise UserError(
             f"{study.test_tree} has no test shape of a family with hidden backs; make some with: "
@@ -160,7 +160,7 @@ def _claims(rows: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict[str, Any]
     return [*reached, *wrong]
 
 
-def make_object(hider: Hider, size: int) -> Object:
+def make_object(hider: AmbiguousObject, size: int) -> Object:
     """The object behind a shape of a tree, in a picture of its front of `size` pixels, drawn with the first back."""
     cone = FAMILIES[hider.category].cone
     assert cone is not None
@@ -170,7 +170,9 @@ def make_object(hider: Hider, size: int) -> Object:
     camera = orbit_camera(np.array([azimuth]), np.array([cone.elevation_deg]), size)
     views = Renderer(surface_of(variants[0])).render(camera)
     backs, again = (
-        torch.from_numpy(np.stack([sample_union(solids, store.POINTS, rng) for solids in variants])).float()
+        torch.from_numpy(
+            np.stack([sample_union(solids, tree_files.POINTS, rng) for solids in variants])
+        ).float()
         for _ in range(2)
     )
     image = torch.from_numpy(views.images[0]).permute(2, 0, 1).float() / 255
@@ -255,7 +257,7 @@ def _of_count(metrics: Metrics, count: int) -> Metrics:
 def _measured(
     study: Study,
     config: FitConfig,
-    hiders: Sequence[Hider],
+    hiders: Sequence[AmbiguousObject],
     objects: Callable[[], list[Object]],
     codes: Sequence[int],
 ) -> dict[int, Metrics]:
@@ -281,7 +283,7 @@ def predict(model: Predictor, image: Tensor, count: int, *, seed: int) -> Tensor
 
 
 def _without_network(
-    study: Study, hiders: Sequence[Hider], objects: Callable[[], list[Object]]
+    study: Study, hiders: Sequence[AmbiguousObject], objects: Callable[[], list[Object]]
 ) -> tuple[Metrics, Metrics]:
     """Random training shapes of the category, and samples of the backs themselves, as large as one prediction."""
     config = study.config(unchanged, seed=0)
@@ -342,7 +344,7 @@ def markdown(result: Mapping[str, Any]) -> str:
     return "\n".join([*lines, ""])
 
 
-def _figure(study: Study, hiders: Sequence[Hider], size: int) -> Figure:
+def _figure(study: Study, hiders: Sequence[AmbiguousObject], size: int) -> Figure:
     """For one object of each family: the front, its backs, and predictions with a few codes, all from one side
     behind."""
     chosen = list({hider.category: hider for hider in reversed(hiders)}.values())[::-1]

@@ -8,14 +8,14 @@ import functools
 import torch
 
 from models import Predictor
-from train.config import FitConfig, with_variant
+from train.config import FitConfig
 from train.data.batches import LoadedSplit
-from train.evaluation.per_shape import SHAPES_AT_ONCE, compare, joined
+from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, of_method, unchanged
 from train.experiments.table import Claim, Row, Table, below
 from train.experiments.ten_predictions import ten_predictions
-from train.methods.systems import METHODS
+from train.methods import get_method, ours
 
 
 def without_codes(config: FitConfig) -> FitConfig:
@@ -54,7 +54,7 @@ def _with_beta(config: FitConfig, *, beta: float) -> FitConfig:
 
 def highly_diverse(config: FitConfig) -> FitConfig:
     """The paper's model with more diverse predictions."""
-    return with_variant(config, "highly-diverse")
+    return ours.highly_diverse(config)
 
 
 def second_stage_without_diversity(config: FitConfig) -> FitConfig:
@@ -110,15 +110,15 @@ _R2N2 = {"gt_to_pred": 2.47, "pred_to_gt": 3.21, "cd": 5.68}
 
 def _oracle(row: Row, study: Study, config: FitConfig) -> Metrics:
     """Errors of a method's representation of the ground truth: its grid, its maps or its number of points."""
-    represent = METHODS[config.system].ideal
-    assert represent is not None
+    method = get_method(config.system)
 
     def measure(network: Predictor, test: LoadedSplit) -> Metrics:
         parts = []
         for shapes in torch.arange(len(test)).split(SHAPES_AT_ONCE):
-            clouds = represent(network, test.truth(shapes))
-            parts.append(compare(clouds, test.points[shapes], points=network.points))
-        return joined(parts)
+            clouds = method.oracle(network, test.targets(shapes))
+            assert clouds is not None
+            parts.append(compare_clouds(clouds, test.points[shapes], points=network.points))
+        return concatenate(parts)
 
     return study.measure(config, ["oracle"], measure, stage=0)
 

@@ -14,7 +14,7 @@ from diffpoint import PinholeCamera, nearest, visible_points
 from models import Generator, Predictor
 from train.data import ShapeTree
 from train.data.batches import LoadedSplit
-from train.evaluation.per_shape import answers, joined
+from train.evaluation.per_shape import concatenate, sample_predictions
 from train.evaluation.report import make_example, pick_shapes
 from train.experiments.frame import Experiment, Outcome
 from train.experiments.markdown import table_lines
@@ -58,8 +58,8 @@ predictions = Experiment(make, lambda study: study.configs(unchanged))
 
 def _measured(study: Study, config: Any) -> Metrics:
     def measure(model: Predictor, test: LoadedSplit) -> Metrics:
-        found = answers(model, test, codes=CODES, seed=config.seed)
-        return joined([variation(clouds, shown.camera) for _, shown, clouds in found])
+        found = sample_predictions(model, test, codes=CODES, seed=config.seed)
+        return concatenate([variation(clouds, shown.camera) for _, shown, clouds in found])
 
     return study.measure(config, ["variation", CODES], measure)
 

@@ -21,18 +21,17 @@ from typing import Any, Literal
 import torch
 
 from models import Predictor
-from train.config import PROFILES, FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
+from train.config import FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
 from train.data.batches import LoadedSplit
 from train.errors import UserError
-from train.evaluation.per_shape import SHAPES_AT_ONCE, compare, joined, score
+from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate, evaluate_split
 from train.evaluation.retrieval import medoid, nearest_by_image
 from train.evaluation.runs import best_weights, load_predictor, read_split
 from train.experiments import store
 from train.experiments.side_by_side import run_side_by_side
 from train.experiments.store import Metrics, NotMeasured
 from train.files import write_text
-from train.methods.recipes import with_system
-from train.methods.systems import build_network, cloud_size, image_size
+from train.methods import get_method, recipe
 from train.training import TRAINING_VERSION
 from train.training.trainer import fit
 
@@ -100,7 +99,7 @@ class Study:
 
     def config(self, change: Change, *, seed: int) -> FitConfig:
         """The profile's configuration with the changes of a variant."""
-        config = dataclasses.replace(change(PROFILES[self.profile]), seed=seed, picture_every=0)
+        config = dataclasses.replace(change(recipe("ours", self.profile)), seed=seed, picture_every=0)
         return config if self.steps is None else with_steps(config, self.steps)
 
     def configs(self, *changes: Change) -> list[FitConfig]:
@@ -137,7 +136,7 @@ class Study:
             split: which one.
             limit: at most so many shapes; if not given, all training shapes, or `self.limit` of the others.
         """
-        size = image_size(config)
+        size = get_method(config.system).image_size(config)
         limit = limit or (self.limit if split != "train" else None)
         key = (self.test_tree, limit, split, *size, config.map_size, config.gt_pool, config.categories)
         if key not in self._splits:
@@ -225,7 +224,7 @@ class Study:
         """
         if stage == 0:
             torch.manual_seed(config.seed)
-            return build_network(config)
+            return get_method(config.system).build(config)
         run = self.train(config, stage=stage)
         has_stage = f"stage{stage}" in config.phases
         return load_predictor(best_weights(run, stage) if has_stage else run)
@@ -287,7 +286,7 @@ class Study:
         return self.measure(
             config,
             what,
-            lambda model, data: score(
+            lambda model, data: evaluate_split(
                 model, data, settings, views=views, seed=config.seed, code_seed=code_seed
             ),
             stage=stage,
@@ -306,7 +305,7 @@ class Study:
             views: from which images are retrieved.
         """
         test, train = self.split(config, "test"), self.split(config, "train")
-        points = cloud_size(config)
+        points = get_method(config.system).cloud_size(config)
 
         def measure() -> Metrics:
             if baseline == "medoid":
@@ -314,9 +313,12 @@ class Study:
             else:
                 clouds = train.points[nearest_by_image(test, train, views=(views,))[views]]
             parts = zip(clouds.split(SHAPES_AT_ONCE), test.points.split(SHAPES_AT_ONCE), strict=True)
-            return joined([compare(cloud.contiguous(), true, points=points) for cloud, true in parts])
+            return concatenate(
+                [compare_clouds(cloud.contiguous(), true, points=points) for cloud, true in parts]
+            )
 
-        key = [baseline, points, image_size(config), views, train.fingerprint, test.fingerprint]
+        size = get_method(config.system).image_size(config)
+        key = [baseline, points, size, views, train.fingerprint, test.fingerprint]
         return self.kept(key, measure)
 
     def is_kept(self, function: Callable[[Study], object]) -> bool:
@@ -386,7 +388,11 @@ def unchanged(config: FitConfig) -> FitConfig:
 
 def of_method(name: Any) -> Change:
     """The profile's recipe for another method."""
-    return functools.partial(with_system, system=name)
+    return functools.partial(_recipe_like, name=name)
+
+
+def _recipe_like(config: FitConfig, name: str) -> FitConfig:
+    return recipe(name, config.profile)
 
 
 def stage1_of(config: FitConfig) -> FitConfig:

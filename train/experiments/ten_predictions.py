@@ -12,12 +12,18 @@ from models import Critic, Predictor, critic_loss, gradient_penalty
 from train.config import FitConfig, StageConfig
 from train.data.batches import Batch, LoadedSplit
 from train.evaluation.metrics import visible_error
-from train.evaluation.per_shape import answers, distance_between, distance_to_nearest, joined, one_view_each
+from train.evaluation.per_shape import (
+    concatenate,
+    distance_to_nearest,
+    one_view_each,
+    pairwise_distance,
+    sample_predictions,
+)
 from train.evaluation.runs import load_autoencoder
 from train.experiments.store import Metrics
 from train.experiments.study import Study
 from train.experiments.table import Row
-from train.methods.systems import cloud_size
+from train.methods import get_method
 
 _PREDICTIONS = 10
 _NEAREST_AMONG = 300
@@ -39,12 +45,12 @@ def ten_predictions(row: Row, study: Study, config: FitConfig) -> Metrics:
         the nearest training shape; and for rows with `critic_of` "critic", see `below_real_shapes`. Diversity alone
         does not distinguish other shapes from noise; the others do.
     """
-    points, train = cloud_size(config), study.split(config, "train")
+    points, train = get_method(config.system).cloud_size(config), study.split(config, "train")
     some = torch.linspace(0, len(train) - 1, min(_NEAREST_AMONG, len(train))).long()
 
     def distances(source: Source, test: LoadedSplit) -> Metrics:
         real = train.points[some, :points]
-        return joined(
+        return concatenate(
             [_distances(shown, clouds, real=real) for _, shown, clouds in source(test, _PREDICTIONS)]
         )
 
@@ -76,13 +82,15 @@ def _measure(
 ) -> Metrics:
     """A measurement of the predictions of a row's network; or of samples of the ground truth in their place."""
     if row.source == "truth":
-        test, points = study.split(config, "test"), cloud_size(config)
+        test, points = study.split(config, "test"), get_method(config.system).cloud_size(config)
         source = functools.partial(_samples, points=points, seed=config.seed)
         key = [f"{name} of samples", config.seed, points, test.fingerprint, *inputs]
         return study.kept(key, lambda: function(source, test))
 
     def of_network(model: Predictor, test: LoadedSplit) -> Metrics:
-        return function(lambda split, count: answers(model, split, codes=count, seed=config.seed), test)
+        return function(
+            lambda split, count: sample_predictions(model, split, codes=count, seed=config.seed), test
+        )
 
     return study.measure(
         config, [f"{name} of predictions", _PREDICTIONS, *inputs], of_network, stage=row.stage
@@ -104,7 +112,7 @@ def _samples(
 def _distances(shown: Batch, clouds: Tensor, *, real: Tensor) -> Metrics:
     visible = [visible_error(cloud, shown.camera, shown.depth)[:, 0] for cloud in clouds]
     return {
-        "diversity": distance_between(clouds),
+        "diversity": pairwise_distance(clouds),
         "visible": torch.stack(visible).mean(0),
         "novelty": distance_to_nearest(clouds[0], real),
     }

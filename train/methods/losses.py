@@ -1,9 +1,11 @@
-"""The terms of the training loss, in the paper's units."""
+"""Terms of training losses that several methods or stages share, in the paper's units."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
+import torch
 from torch import Tensor
 
 from diffpoint import (
@@ -11,27 +13,32 @@ from diffpoint import (
     chamfer_distance,
     diversity_loss,
     earth_mover_distance,
+    front_terms,
     projection_loss,
     soft_projection_loss,
 )
-from diffpoint.losses import FrontSets, front_sets
-from diffpoint.visibility import Method as Visibility
-from train.config import StageConfig
+from models import Predictor
+from train.config import StageConfig, Visibility
+from train.data.batches import Batch, Targets
+from train.methods.base import Noise
 
 # The stage-1 distance is a sum over the matched points, whose number grows with the map's area; the paper's
 # weights of the other terms belong to maps of 56 x 56.
 _PAPER_MAP_SIZE = 56
 
-# How far above the least a transport may be of which a network learns.
+# Relative tolerance of a transport that a network is trained on.
 TRANSPORT_TOLERANCE = 0.02
 
-# How far above the least the diversity loss may take a transport, where it has to know it at all. It is 2 % above in
-# the mean then, a third faster than at 0.05, and the approximation of the paper's own code is 30 % above.
-_SPREAD_TOLERANCE = 0.2
+# Relative tolerance of a transport that only selects which of several clouds is nearest. It is 2 % above the optimum in
+# the mean, where the clouds of five codes differ by 30 %, and takes half the time.
+_SELECTION_TOLERANCE = 0.2
+
+# Relative tolerance of the diversity loss's transports, where they have to be computed at all. They are 2 % above the
+# optimum in the mean then, a third faster than at 0.05; the approximation of the paper's own code is 30 % above.
+_DIVERSITY_TOLERANCE = 0.2
 
 # A transport between the joined clouds of many views would take most of a step.
 _JOINED_POINTS = 512
-
 
 # Footprints of the soft projection loss: from a ninth of the map, so that points far from the silhouette reach it, to
 # three quarters of a pixel at half of the stage: the radii of the study on free clouds.
@@ -40,156 +47,114 @@ _SOFT_START_SHARE, _SOFT_END_PIXELS = 1 / 9, 0.75
 _LIN_UPSAMPLE = 2
 
 
-class Scene(NamedTuple):
-    """Clouds beside what is known of them.
-
-    Attributes:
-        points: (B, M, 3).
-        camera: (B, V).
-        depth: (B, V, S, S).
-        logits: (B, M) of the points' existence, or None.
-    """
-
-    points: Tensor
-    camera: PinholeCamera
-    depth: Tensor
-    logits: Tensor | None = None
-
-
-class Front(NamedTuple):
-    """The front constraint or what stands in its place, and how much it had to hold on to.
+class ViewLoss(NamedTuple):
+    """A loss between clouds and the depth maps of their views.
 
     Attributes:
         loss: scalar, the mean of `each`.
-        each: (scenes, V), every view's own.
-        shares: for the log; of the front constraint "matched_share", the mean share of observed points that have a
+        each: (clouds, V), of every cloud and view.
+        statistics: for the log; of the front constraint "matched_share", the mean share of observed points that have a
             visible predicted point to match (at most 1), and "fallback_share", the share of views in which no
-            predicted point was visible and the whole cloud stood in.
+            predicted point is visible and the whole cloud is compared instead.
     """
 
     loss: Tensor
     each: Tensor
-    shares: dict[str, Tensor]
+    statistics: dict[str, Tensor]
 
 
-def arrange_scenes(
-    clouds: Tensor,
-    camera: PinholeCamera,
-    depth: Tensor,
-    *,
-    joined_views: bool,
-    logits: Tensor | None = None,
-) -> Scene:
-    """Puts predictions before the cameras that judge them.
+def view_loss(
+    clouds: Tensor, batch: Batch, stage: StageConfig, *, step: int, logits: Tensor | None = None
+) -> ViewLoss:
+    """Compares predictions with the depth maps of their images, as `StageConfig.supervision` says.
+
+    The losses that replace the front constraint have its unit: where it is a sum over matched points, their mean over
+    pixels is multiplied by the number of observed pixels, and where it is a mean, by 100.
 
     Args:
-        clouds: (R, B*V, N, 3), one cloud for each code and image.
-        camera: (B, V).
-        depth: (B, V, S, S).
-        joined_views: False: R*B*V scenes, each cloud before the one camera of its image. True: R*B scenes, the V
-            clouds of one shape and code slot concatenated before the V cameras.
-        logits: (R, B*V, N) of the points' existence, if it is known.
+        clouds: (R, B*V, N, 3), one cloud for each code and image, world frame.
+        batch: the images' depth maps and cameras.
+        stage: which loss; with `joined_views` the clouds of a shape's V views are concatenated for each code, and the
+            whole is compared with the depth map of each view.
+        step: number of the step within the stage, for the schedule of the soft footprints.
+        logits: (R, B*V, N) occupancy logits of the points, if the network gives them.
     """
-    codes, points = clouds.shape[0], clouds.shape[2]
-    shapes, views = depth.shape[:2]
-    together = views if joined_views else 1
-    scenes = codes * shapes * views // together
-
-    def before_scenes(value: Tensor) -> Tensor:
-        return value.expand(codes, *value.shape).reshape(scenes, together, *value.shape[2:])
-
-    K, cam_from_world = before_scenes(camera.K), before_scenes(camera.cam_from_world)
-    return Scene(
-        clouds.reshape(scenes, together * points, 3),
-        PinholeCamera(K, cam_from_world, camera.height, camera.width),
-        before_scenes(depth),
-        None if logits is None else logits.reshape(scenes, together * points),
-    )
-
-
-def supervise(scene: Scene, stage: StageConfig, *, step: int) -> Front:
-    """Compares clouds with the depth maps of their views, as the stage says (`StageConfig.supervision`).
-
-    The losses that stand in the place of the front constraint take its unit: where it is a sum over matched points,
-    their mean over pixels counts once for every observed pixel, and where it is a mean, x100.
-    """
+    points, camera, depth = pair_with_views(clouds, batch, joined_views=stage.joined_views)
     if stage.supervision == "front":
-        return front_loss(scene, stage.front, visibility=stage.visibility)
-    points, camera, depth = scene.points, scene.camera, scene.depth
+        return front_loss(points, camera, depth, stage.front, visibility=stage.visibility)
     observed = depth.isfinite().sum((-2, -1))
     if stage.supervision == "soft":
-        each = soft_projection_loss(
-            points, camera, depth, radius=_soft_radius(stage, depth.shape[-1], step), reduction="none"
-        )
+        radius = _soft_radius(stage, depth.shape[-1], step)
+        each = soft_projection_loss(points, camera, depth, radius=radius, reduction="none")
     elif stage.supervision == "projection":
         each = projection_loss(points, camera, depth, reduction="none")
     else:
         # In sums over pixels both terms weigh the same; see `projection_loss`.
         pixels = depth.shape[-2] * depth.shape[-1]
-        mask_weight = pixels / max(1.0, observed.float().mean().item())
         each = projection_loss(
             points, camera, depth,
-            logits=scene.logits, mask_weight=mask_weight, upsample=_LIN_UPSAMPLE, reduction="none",
+            logits=None if logits is None else logits.reshape(points.shape[:2]),
+            mask_weight=pixels / max(1.0, observed.float().mean().item()), upsample=_LIN_UPSAMPLE, reduction="none",
         )  # fmt: skip
-    each = each * (100 if stage.front == "chamfer" else _same_area(depth) * observed)
-    return Front(each.mean(), each, {})
+    each = each * (100 if stage.front == "chamfer" else _area_factor(depth) * observed)
+    return ViewLoss(each.mean(), each, {})
 
 
-def _soft_radius(stage: StageConfig, map_size: int, step: int) -> float:
-    """Of soft footprints in pixels, on a geometric way to its end at half of the stage."""
-    start = max(_SOFT_END_PIXELS, _SOFT_START_SHARE * map_size)
-    return start * (_SOFT_END_PIXELS / start) ** min(1.0, 2 * step / max(1, stage.steps))
+def pair_with_views(
+    clouds: Tensor, batch: Batch, *, joined_views: bool
+) -> tuple[Tensor, PinholeCamera, Tensor]:
+    """Arranges clouds, cameras and depth maps so that each cloud lies beside the views that judge it.
 
+    Args:
+        clouds: (R, B*V, N, 3).
+        batch: cameras (B, V) and depth maps (B, V, S, S).
+        joined_views: False: R*B*V clouds, each with the one view of its image. True: R*B clouds, the V clouds of a
+            shape concatenated, each with the shape's V views.
 
-def _same_area(depth: Tensor) -> float:
-    """What a pixel of the paper's maps would be in pixels of these."""
-    return (_PAPER_MAP_SIZE / depth.shape[-1]) ** 2
+    Returns:
+        Points (M, N', 3), cameras (M, V') and depth maps (M, V', S, S).
+    """
+    codes, points = clouds.shape[0], clouds.shape[2]
+    shapes, views = batch.depth.shape[:2]
+    together = views if joined_views else 1
+    count = codes * shapes * views // together
+
+    def for_each_code(value: Tensor) -> Tensor:
+        return value.expand(codes, *value.shape).reshape(count, together, *value.shape[2:])
+
+    camera = batch.camera
+    K, cam_from_world = for_each_code(camera.K), for_each_code(camera.cam_from_world)
+    return (
+        clouds.reshape(count, together * points, 3),
+        PinholeCamera(K, cam_from_world, camera.height, camera.width),
+        for_each_code(batch.depth),
+    )
 
 
 def front_loss(
-    scene: Scene,
+    points: Tensor,
+    camera: PinholeCamera,
+    depth: Tensor,
     distance: Literal["emd", "chamfer"],
     *,
     visibility: Visibility = "zbuffer",
     tolerance: float = TRANSPORT_TOLERANCE,
-) -> Front:
-    """Compares the visible predicted points with the observed points of each view, in the paper's units.
+) -> ViewLoss:
+    """`diffpoint.front_terms` in the paper's units.
 
-    "emd": earth mover's distance as a SUM over matched points, scaled as if on a 56 x 56 map, with transports within
-    `tolerance`. "chamfer": both directions, x100.
+    "emd": earth mover's distance as a SUM over matched points, scaled as if on a 56 x 56 map. "chamfer": both
+    directions, x100. A view whose depth map is empty constrains nothing and counts 0.
     """
-    sets = front_sets(scene.points, scene.camera, scene.depth, visibility=visibility)
-    if distance == "chamfer":
-        terms = chamfer_distance(
-            sets.predicted,
-            sets.observed,
-            squared=False,
-            a_lengths=sets.predicted_lengths,
-            b_lengths=sets.observed_lengths,
-        )
-        each = 100 * (terms.a_to_b + terms.b_to_a)
-    else:
-        transport = earth_mover_distance(
-            sets.predicted,
-            sets.observed,
-            tolerance=tolerance,
-            a_lengths=sets.predicted_lengths,
-            b_lengths=sets.observed_lengths,
-        )
-        each = _same_area(scene.depth) * transport.cost * _matched(sets)
-    shares = {
-        "matched_share": (_matched(sets) / sets.observed_lengths.clamp(min=1)).mean(),
-        "fallback_share": sets.fallback.float().mean(),
+    terms = front_terms(points, camera, depth, distance=distance, visibility=visibility, tolerance=tolerance)
+    each = 100 * terms.loss if distance == "chamfer" else _area_factor(depth) * terms.loss * terms.matched
+    statistics = {
+        "matched_share": (terms.matched / terms.observed.clamp(min=1)).mean(),
+        "fallback_share": terms.fallback.float().mean(),
     }
-    return Front(each.mean(), each, shares)
+    return ViewLoss(each.mean(), each, statistics)
 
 
-def _matched(sets: FrontSets) -> Tensor:
-    """Pairs that an assignment makes: as many as the smaller set has points."""
-    return sets.predicted_lengths.minimum(sets.observed_lengths)
-
-
-def spread_loss(codes: Tensor, clouds: Tensor, stage: StageConfig, *, views: int, step: int) -> Tensor:
+def diversity_term(codes: Tensor, clouds: Tensor, stage: StageConfig, *, views: int, step: int) -> Tensor:
     """The diversity loss on a part of the batch and of the points, as the stage says.
 
     Single-view clouds of one image must differ as much as their codes do; with `stage.joined_diversity`, the joined
@@ -213,8 +178,80 @@ def spread_loss(codes: Tensor, clouds: Tensor, stage: StageConfig, *, views: int
         every = max(1, stage.shapes * stage.views // stage.diversity_images)
     thin = slice(step % stride, None, stride)
     return diversity_loss(
-        codes[:, ::every],
-        clouds[:, ::every, thin],
-        alpha=stage.exact_alpha,
-        tolerance=_SPREAD_TOLERANCE,
+        codes[:, ::every], clouds[:, ::every, thin], alpha=stage.exact_alpha, tolerance=_DIVERSITY_TOLERANCE
     )
+
+
+def cloud_distances(
+    clouds: Tensor, targets: Tensor, stage: StageConfig, *, step: int, tolerance: float = TRANSPORT_TOLERANCE
+) -> Tensor:
+    """Distances x100 between predictions and whole target clouds, by the stage's `front` distance.
+
+    Args:
+        clouds: (R, B, N, 3).
+        targets: (B, P, 3) with P >= N; the earth mover's distance takes N of them, which ones changes with the step.
+        stage: "chamfer" (both directions) or "emd".
+        step: number of the step within the stage.
+        tolerance: relative tolerance of the transports.
+
+    Returns:
+        (R, B).
+    """
+    if stage.front == "chamfer":
+        both = chamfer_distance(clouds, targets.expand(len(clouds), *targets.shape), squared=False)
+        return 100 * (both.a_to_b + both.b_to_a)
+    every = max(1, targets.shape[1] // clouds.shape[2])
+    thin = targets[:, step % every :: every][:, : clouds.shape[2]]
+    thin = thin.expand(len(clouds), *thin.shape).contiguous()
+    return 100 * earth_mover_distance(clouds, thin, tolerance=tolerance).cost
+
+
+def best_of_n(
+    network: Predictor, batch: Batch, noise: Noise, distances: Callable[[Tensor, float], Tensor]
+) -> dict[str, Tensor]:
+    """Minimum over n: of the predictions from R codes, each image's nearest one is trained.
+
+    All R clouds are compared without a graph; then the best one of each image is predicted again, with one.
+
+    Args:
+        network: takes codes.
+        batch: B shapes with V images each.
+        noise: R codes for each image.
+        distances: (R, B*V, N, 3) clouds and a relative tolerance of transports -> (R, B*V).
+    """
+    images = batch.images.flatten(0, 1)
+    with torch.no_grad():
+        all_distances = distances(network(images, noise.codes), _SELECTION_TOLERANCE)
+    best = all_distances.argmin(0)
+    codes = noise.codes[best, torch.arange(len(best))][None]
+    loss = distances(network(images, codes), TRANSPORT_TOLERANCE).mean()
+    return {"loss": loss, "mean_of_all": all_distances.mean()}
+
+
+def targets_of(batch: Batch) -> Targets:
+    """The targets of a batch that was drawn with them."""
+    assert batch.targets is not None
+    return batch.targets
+
+
+def for_each_image(values: Tensor, batch: Batch) -> Tensor:
+    """(B, ...) of shapes -> (B*V, ...), once for each of their images."""
+    return values.repeat_interleave(batch.images.shape[1], dim=0)
+
+
+def target_cameras(batch: Batch, views: Tensor) -> PinholeCamera:
+    """(B*V, K): K of the target cameras of each shape, for each of its images' predictions."""
+    camera = targets_of(batch).camera
+    K, pose = (for_each_image(matrix[:, views], batch) for matrix in (camera.K, camera.cam_from_world))
+    return PinholeCamera(K, pose, camera.height, camera.width)
+
+
+def _soft_radius(stage: StageConfig, map_size: int, step: int) -> float:
+    """Radius of soft footprints in pixels: shrinks geometrically until half of the stage."""
+    start = max(_SOFT_END_PIXELS, _SOFT_START_SHARE * map_size)
+    return start * (_SOFT_END_PIXELS / start) ** min(1.0, 2 * step / max(1, stage.steps))
+
+
+def _area_factor(depth: Tensor) -> float:
+    """Area of a pixel of these maps in pixels of the paper's maps."""
+    return (_PAPER_MAP_SIZE / depth.shape[-1]) ** 2

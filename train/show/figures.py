@@ -236,9 +236,9 @@ def errors_figure(result: dict[str, Any]) -> Figure:
     return figure
 
 
-def save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: str | Path) -> None:
     """Writes a PNG, atomically."""
-    with replacing(path) as temporary:
+    with replacing(Path(path)) as temporary:
         figure.savefig(temporary, format="png", facecolor="white")
 
 

@@ -44,7 +44,7 @@ pre { background: white; border: 1px solid #dde3e8; padding: .8rem; overflow-x: 
 
 
 def write_reconstruction_page(
-    path: Path, images: Tensor, points: Tensor, *, title: str, subtitle: str = ""
+    path: str | Path, images: Tensor, points: Tensor, *, title: str, subtitle: str = ""
 ) -> None:
     """Writes a page with the pictures of an object and the cloud found from them, to be turned by hand.
 
@@ -62,7 +62,7 @@ def write_reconstruction_page(
         "<h2>What came out</h2>",
         row([cloud(points, "Drag to turn, scroll to come closer. Colour is height.", height_px=640)]),
     ]
-    write_text(path, page(title, body, subtitle=subtitle))
+    write_text(Path(path), page(title, body, subtitle=subtitle))
 
 
 def page(title: str, body: Sequence[str], *, subtitle: str = "") -> str:

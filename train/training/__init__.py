@@ -1,4 +1,4 @@
 """Training: the loop, checkpoints, validation and logs."""
 
 TRAINING_VERSION = 1
-"""Raise it when a change makes trainings end with other weights: experiments then train anew and reuse no old run."""
+"""Raise it when a change makes trainings end with other weights: experiments then do not reuse earlier runs."""

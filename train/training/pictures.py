@@ -1,4 +1,4 @@
-"""Pictures of what a generator in training makes of shapes that it does not train on."""
+"""Pictures of a generator's predictions for validation shapes, drawn during training."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _PIXELS = 128
 
 
 @torch.no_grad()
-def draw_predictions(model: Predictor, val: LoadedSplit, path: Path, *, seed: int) -> None:
-    """Draws a few shapes of a split: predictions of one image and several codes, all views joined, and the truth.
+def draw_predictions(model: Predictor, val: LoadedSplit, path: str | Path, *, seed: int) -> None:
+    """Writes a PNG of a few shapes: predictions from one image and several codes, all views joined, ground truth.
 
-    The shapes and codes are the same at every call with the same seed.
+    Shapes and codes are the same at every call with the same seed.
     """
     from train.show import figures  # matplotlib takes a second to import
 
@@ -41,5 +41,5 @@ def draw_predictions(model: Predictor, val: LoadedSplit, path: Path, *, seed: in
 
 
 def _square(images: Tensor) -> Tensor:
-    """(V, 3, h, w) of the network's input, which is stretched -> (V, 3, _PIXELS, _PIXELS)."""
+    """(V, 3, h, w) network inputs, whose aspect is changed -> (V, 3, _PIXELS, _PIXELS)."""
     return F.interpolate(images, size=(_PIXELS, _PIXELS), mode="bilinear", align_corners=False)

@@ -1,58 +1,60 @@
-"""Training: one loop for the auto-encoder and both stages, whose differences are data.
+"""Training: one loop and one step for all methods and phases, whose differences are data.
 
-What happens in a step is in train/step.py; what a run keeps, in train/state.py.
+`fit` is what the command line calls. `Trainer` holds what changes during a run and takes the steps; the loss of a step
+is the method's (train/methods).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm import tqdm
 
-from train.config import FitConfig, fit_config_from_json, to_json
-from train.data.batches import LoadedSplit
+from train.config import FitConfig, PretrainConfig, StageConfig, fit_config_from_json, to_json
+from train.data.batches import Batch, LoadedSplit, Sampler
 from train.data.tree import require_depth
-from train.distributed import World, gather
+from train.distributed import SINGLE, World, connect
 from train.errors import UserError
-from train.evaluation.runs import best_weights, latest_checkpoint, load_autoencoder, read_split
+from train.evaluation.runs import (
+    best_weights,
+    latest_checkpoint,
+    load_autoencoder,
+    load_predictor,
+    read_split,
+)
 from train.files import write_text
-from train.methods.systems import image_size
+from train.methods import get_method
+from train.methods.base import Noise, Step, adam, check_finite, set_learning_rate
 from train.methods.weights import save_weights
 from train.processes import StopRequest
-from train.training.checkpoint import save_checkpoint
+from train.timer import Timer
+from train.training.checkpoint import load_networks, load_state, save_checkpoint
+from train.training.collapse import CollapseCheck
 from train.training.log import RunLog
 from train.training.pictures import draw_predictions
-from train.training.state import Training
+from train.training.validation import validate, validate_autoencoder
 
-_HEALTH_IMAGES = 12
-# The number that records carry for a phase.
+_COLLAPSE_CHECK_IMAGES = 12
+# The number of each phase in the records of the log.
 STAGES = {"autoencoder": 0, "stage1": 1, "stage2": 2}
 
 
-class _Run(NamedTuple):
-    """What stays the same while a run goes on."""
-
-    out: Path
-    train: LoadedSplit
-    val: LoadedSplit
-    health_images: Tensor
-    log: RunLog
-    stop: StopRequest
-    world: World
-    progress: bool
-
-
 def fit(
-    data: Path | Sequence[Path], out: Path, config: FitConfig, *, resume: bool = False, progress: bool = True
+    data: str | Path | Sequence[str | Path],
+    out: str | Path,
+    config: FitConfig,
+    *,
+    resume: bool = False,
+    progress: bool = True,
 ) -> bool:
-    """Trains a generator and keeps everything about it in the run directory `out`.
+    """Trains a network and keeps everything about it in the run directory `out`.
 
     Args:
         data: root of a data tree with train and val splits, or of each of several that are put together.
@@ -67,90 +69,326 @@ def fit(
     Raises:
         UserError: unusable data or run, a configuration that does not fit them, or a training that has failed.
     """
-    world = gather()
-    progress = progress and world.writes
+    roots, out = [Path(root) for root in ([data] if isinstance(data, (str, Path)) else data)], Path(out)
+    world = connect()
+    progress = progress and world.is_main
     _check_run_directory(out, config, resume=resume)
-    require_depth([data] if isinstance(data, Path) else data)
-    read = functools.partial(read_split, config, data, image_size=image_size(config), progress=progress)
-    train, val = read("train"), read("val", limit=config.validation_shapes)
+    method = get_method(config.system)
+    method.check(config)
+    require_depth(roots)
+    image_size = method.image_size(config)
+    train = read_split(config, roots, "train", image_size=image_size, progress=progress)
+    val = read_split(
+        config, roots, "val", image_size=image_size, limit=config.validation_shapes, progress=progress
+    )
     _check_fits(config, train, world)
-    world.wait()  # all have looked at the directory before one writes into it
+    world.barrier()  # all have looked at the directory before one writes into it
     newest = latest_checkpoint(out)
     # A checkpoint has weights of its own; those that the run started from may be gone.
-    training = Training(config if newest is None else dataclasses.replace(config, start=None), train, world)
+    trainer = Trainer(config if newest is None else dataclasses.replace(config, start=None), train, world)
     if newest is not None:
-        training.resume(out, newest)
+        trainer.resume(out, newest)
     else:
-        if config.autoencoder and config.needs_autoencoder and world.writes:
+        if config.autoencoder and config.needs_autoencoder and world.is_main:
             save_weights(load_autoencoder(config.autoencoder), best_weights(out, "autoencoder"))
-        training.begin_phase(training.phase_name, out)
-    if world.writes:
+        trainer.begin_phase(trainer.phase_name, out)
+    if world.is_main:
         write_text(out / "config.json", to_json(config, data=data))
-    log = RunLog(out, step=training.total_steps, writes=world.writes)
+    log = RunLog(out, step=trainer.total_steps, writes=world.is_main)
     try:
         with StopRequest() as stop:
-            return _run(training, _Run(out, train, val, _health_images(val), log, stop, world, progress))
+            run = _Run(out, val, _collapse_check_images(val), log, stop, progress)
+            names = list(config.phases)
+            for name in names[names.index(trainer.phase_name) :]:
+                if name != trainer.phase_name:
+                    trainer.begin_phase(name, out)
+                if not _run_phase(trainer, run):
+                    return False
+            return True
     finally:
         log.close()
 
 
-def _run(training: Training, run: _Run) -> bool:
-    """Runs all phases that are left; False if a signal ended one early."""
-    names = list(training.config.phases)
-    for name in names[names.index(training.phase_name) :]:
-        if name != training.phase_name:
-            training.begin_phase(name, run.out)
-        if not _run_phase(training, run):
-            return False
-    return True
+class _Run(NamedTuple):
+    """What stays the same during a run."""
+
+    out: Path
+    val: LoadedSplit
+    collapse_check_images: Tensor
+    log: RunLog
+    stop: StopRequest
+    progress: bool
 
 
-def _run_phase(training: Training, run: _Run) -> bool:
+def _run_phase(trainer: Trainer, run: _Run) -> bool:
     """Runs the current phase to its end; False if a signal ended it early."""
-    config, phase, laps, world = training.config, training.phase, training.laps, run.world
+    config, timer, world = trainer.config, trainer.timer, trainer.world
     shown: dict[str, str] = {}
 
     def due(every: int) -> bool:
-        return training.done or training.step % every == 0
+        return trainer.done or trainer.step % every == 0
 
     with tqdm(
-        total=phase.steps, initial=training.step, desc=training.phase_name, disable=not run.progress
+        total=trainer.phase.steps, initial=trainer.step, desc=trainer.phase_name, disable=not run.progress
     ) as bar:
-        laps.begin()
-        while not training.done:
-            report = training.advance()
+        timer.reset()
+        while not trainer.done:
+            report = trainer.train_step()
             bar.update()
             stop = world.any(run.stop.requested)
 
             record: dict[str, Any] = {}
-            if due(config.health_every):
-                record |= training.check_health(run.health_images)
+            if due(config.collapse_check_every):
+                record |= trainer.check_collapse(run.collapse_check_images)
             if due(config.validate_every):
-                record |= training.validate_and_keep_best(run.val, run.out)
+                record |= trainer.validate_and_keep_best(run.val, run.out)
             if record or due(config.log_every):
-                record = {"stage": STAGES[training.phase_name], **_means(report, world), **record}
-                record |= training.schedule() | laps.read()
-                run.log.write(training.total_steps, record)
+                record = {"stage": STAGES[trainer.phase_name], **_means(report, world), **record}
+                record |= trainer.schedule() | timer.read()
+                run.log.write(trainer.total_steps, record)
                 shown |= _bar_values(record)
                 bar.set_postfix(shown, refresh=False)
-            drawn = config.picture_every > 0 and training.phase_name != "autoencoder"
-            if world.writes and drawn and due(config.picture_every):
-                picture = run.out / "figures" / f"predictions-{training.total_steps:08d}.png"
-                draw_predictions(training.learner.generator, run.val, picture, seed=config.seed)
-            if world.writes and (stop or due(config.checkpoint_every)):
+            drawn = config.picture_every > 0 and not trainer.pretraining
+            if world.is_main and drawn and due(config.picture_every):
+                picture = run.out / "figures" / f"predictions-{trainer.total_steps:08d}.png"
+                draw_predictions(trainer.state.network, run.val, picture, seed=config.seed)
+            if world.is_main and (stop or due(config.checkpoint_every)):
                 save_checkpoint(
                     run.out,
-                    training.total_steps,
-                    training.networks(),
-                    training.state(),
+                    trainer.total_steps,
+                    trainer.networks(),
+                    trainer.state_dict(),
                     keep=config.keep_checkpoints,
                 )
-            laps.skip()
+            timer.skip()
             if stop:
                 return False
     if run.progress:
-        print(f"{training.phase_name}: {laps.summary()}", file=sys.stderr)
+        print(f"{trainer.phase_name}: {timer.summary()}", file=sys.stderr)
     return True
+
+
+class Trainer:
+    """Everything that changes during a run and can be saved and restored, and the step that changes it.
+
+    Args:
+        config: the recipe.
+        train: the training split.
+        world: the processes that share each batch. All draw the same random numbers and take their shard.
+    """
+
+    def __init__(self, config: FitConfig, train: LoadedSplit, world: World = SINGLE) -> None:
+        torch.manual_seed(config.seed)
+        self.config, self.method = config, get_method(config.system)
+        self.world, self.timer = world, Timer()
+        self.total_steps = 0
+        self._train = train
+        self._sampler = Sampler(len(train), train.views, seed=config.seed)
+        self._random = torch.Generator().manual_seed(config.seed)
+        self.method.check(config)
+        self.state = self.method.new_state(config)
+        if config.start:
+            self._load_weights(Path(config.start))
+        self.enter_phase(next(iter(config.phases)))
+
+    @property
+    def phase(self) -> PretrainConfig | StageConfig:
+        """Settings of the current phase."""
+        return self.config.phases[self.phase_name]
+
+    @property
+    def pretraining(self) -> bool:
+        """Does the current phase train the auto-encoder?"""
+        return isinstance(self.phase, PretrainConfig)
+
+    @property
+    def trained_network(self) -> nn.Module:
+        """The network that the current phase trains."""
+        network = self.state.autoencoder if self.pretraining else self.state.network
+        assert network is not None
+        return network
+
+    @property
+    def done(self) -> bool:
+        """Has the current phase made its steps?"""
+        return self.step >= self.phase.steps
+
+    def train_step(self) -> dict[str, Tensor]:
+        """One step of the current phase: draw a batch, compute the method's loss, descend.
+
+        Returns:
+            Scalars without gradient, for the log.
+        """
+        state, timer, phase = self.state, self.timer, self.phase
+        batch, noise = self.draw_batch()
+        timer.mark("data")
+
+        set_learning_rate(state.optimiser, phase.learning_rate_at(self.step))
+        step = Step(phase, self.step, timer, self.world)
+        terms = self.method.losses[self.phase_name](state, batch, noise, step)
+        check_finite(terms["loss"], "the loss is", step)
+        timer.mark("loss")
+
+        state.optimiser.zero_grad(set_to_none=True)
+        terms["loss"].backward()
+        self.world.average_gradients(self.trained_network)
+        state.optimiser.step()
+        timer.mark("network")
+
+        timer.end_step()
+        self.step += 1
+        self.total_steps += 1
+        return {name: value.detach() for name, value in terms.items()}
+
+    def draw_batch(self) -> tuple[Batch | Tensor, Noise]:
+        """Draws the next batch of the current phase: this process's shard, and the random numbers that belong to it."""
+        phase, shard = self.phase, self.world.shard
+        if isinstance(phase, PretrainConfig):
+            return self._draw_clouds(phase.shapes), Noise(torch.empty(0), torch.empty(0))
+        shapes, views = self._sampler.draw(phase.shapes, phase.views)
+        batch = self._train.batch(shard(shapes), shard(views))
+        images = phase.shapes * phase.views
+        codes = torch.randn(phase.codes, images, self.state.network.code_dim, generator=self._random)
+        mix = torch.empty(0)
+        if phase.gamma > 0:
+            mix = torch.rand(phase.n_critic, phase.codes, images, generator=self._random)
+            real = [self._clouds(shapes), *(self._draw_clouds(phase.shapes) for _ in range(phase.real_pool))]
+            batch = batch._replace(real=shard(torch.stack(real), 1))
+        if self.method.uses_targets:
+            batch = batch._replace(targets=self._train.targets(shard(shapes)))
+        return batch, Noise(shard(codes, 1), shard(mix, -1))
+
+    def _draw_clouds(self, shapes: int) -> Tensor:
+        return self._clouds(self._sampler.draw(shapes, 1)[0])
+
+    def _clouds(self, shapes: Tensor) -> Tensor:
+        """(B,) shape numbers -> (B, N, 3) ground truth, N as many as a reconstruction has if there are as many."""
+        assert self.state.autoencoder is not None
+        known = self._train.points.shape[1]
+        wanted = min(known, self.state.autoencoder.config.points)
+        return self._train.clouds(shapes, self._sampler.draw_points(len(shapes), wanted, of=known))
+
+    # --- phases
+
+    def begin_phase(self, name: str, run: Path) -> None:
+        """Starts a phase from the best weights of the phases before, with a new optimiser; the critic goes on."""
+        self.world.barrier()  # until the main process has written those weights
+        self.enter_phase(name)
+        if name == "stage1" and self.config.needs_autoencoder:
+            self._load_autoencoder(run)
+        if name == "stage2" and "stage1" in self.config.phases:
+            self._load_weights(best_weights(run, 1))
+        self.method.begin_phase(self.state, name)
+
+    def enter_phase(self, name: str) -> None:
+        """Starts a phase with the weights as they are, and a new optimiser."""
+        self.phase_name, self.step, self.best = name, 0, math.inf
+        self.collapse_check = CollapseCheck(self.config)
+        state, phase = self.state, self.phase
+        if isinstance(phase, StageConfig):
+            if state.autoencoder is not None:
+                state.autoencoder.freeze()
+            state.optimiser = adam(state.network.train(), weight_decay=phase.weight_decay)
+        else:
+            state.optimiser = adam(self.trained_network.train().requires_grad_(True))
+
+    def _load_weights(self, run_or_file: Path) -> None:
+        found = load_predictor(run_or_file)
+        try:
+            self.state.network.load_state_dict(found.state_dict())
+        except RuntimeError:
+            raise UserError(
+                f"{run_or_file} holds the weights of another network than the one to be trained (--system, --profile, "
+                "--output-head, --deterministic); start from one of the same kind"
+            ) from None
+
+    def _load_autoencoder(self, run: Path) -> None:
+        found = load_autoencoder(best_weights(run, "autoencoder"))
+        wanted = self.state.network.points
+        if self.config.output_head == "latent" and found.config.points != wanted:
+            raise UserError(
+                f"the auto-encoder makes {found.config.points} points, the generator with output head 'latent' "
+                f"{wanted}; train one of this profile, or leave --autoencoder out"
+            )
+        self.state.autoencoder = found
+
+    # --- what is measured on the way
+
+    def schedule(self) -> dict[str, float]:
+        """What the phase's schedules gave for the step that was just taken."""
+        phase, step = self.phase, self.step - 1
+        weight = {"diversity_weight": phase.diversity_weight(step)} if isinstance(phase, StageConfig) else {}
+        return {"learning_rate": phase.learning_rate_at(step), **weight}
+
+    def check_collapse(self, images: Tensor) -> dict[str, float]:
+        """Measures what image and code do; ends a run whose network ignores its image."""
+        if self.pretraining:
+            return {}
+        may_fail = self.phase_name != "stage1" or self.step >= self.config.collapse_patience
+        return self.collapse_check(
+            self.state.network, images, may_fail=may_fail, total_steps=self.total_steps
+        )
+
+    def validate_and_keep_best(self, val: LoadedSplit, run: Path) -> dict[str, float]:
+        """Validates, and saves the weights if they are the phase's best so far, or if the last ones are wanted."""
+        phase, seed = self.phase, self.config.seed
+        if isinstance(phase, PretrainConfig):
+            assert self.state.autoencoder is not None
+            select, figures = "autoencoder_cd", validate_autoencoder(self.state.autoencoder, val, seed=seed)
+        else:
+            select, figures = phase.select, validate(self.state.network, val, seed=seed, world=self.world)
+        if select == "last" or figures[f"val_{select}"] < self.best:
+            self.best = figures.get(f"val_{select}", self.best)
+            if self.world.is_main:
+                save_weights(self.trained_network, best_weights(run, self.phase_name))
+        return figures
+
+    # --- checkpoints
+
+    def networks(self) -> dict[str, nn.Module]:
+        """The networks in a checkpoint of the current phase, by the names of their files."""
+        if self.pretraining:
+            return {"autoencoder": self.trained_network}
+        critic = {} if self.state.critic is None else {"critic": self.state.critic}
+        return {"weights": self.state.network, **critic}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything but the weights that decides how training continues."""
+        critic_optimiser = self.state.critic_optimiser
+        return {
+            "phase": self.phase_name,
+            "step": self.step,
+            "total_steps": self.total_steps,
+            "best": self.best,
+            "failed_collapse_checks": self.collapse_check.failed,
+            "optimiser": self.state.optimiser.state_dict(),
+            "critic_optimiser": None if critic_optimiser is None else critic_optimiser.state_dict(),
+            "sampler": self._sampler.state(),
+            "random": self._random.get_state(),
+            "torch": torch.get_rng_state(),
+            "fingerprint": self._train.fingerprint,
+        }
+
+    def resume(self, run: Path, checkpoint: Path) -> None:
+        """Restores what `networks` and `state_dict` gave when a checkpoint of the run was written."""
+        saved = load_state(checkpoint)
+        if saved["fingerprint"] != self._train.fingerprint:
+            raise UserError(
+                f"{checkpoint} was trained on other data (their shapes or points differ); resume with those"
+            )
+        self.enter_phase(saved["phase"])
+        if not self.pretraining and self.config.needs_autoencoder:
+            self._load_autoencoder(run)
+        load_networks(checkpoint, self.networks())
+        self.step, self.total_steps, self.best = saved["step"], saved["total_steps"], saved["best"]
+        # The second name is that of earlier versions.
+        self.collapse_check.failed = saved.get("failed_collapse_checks", saved.get("deaf_checks", 0))
+        self.state.optimiser.load_state_dict(saved["optimiser"])
+        if self.state.critic_optimiser is not None:
+            self.state.critic_optimiser.load_state_dict(saved["critic_optimiser"])
+        self._sampler.restore(saved["sampler"])
+        self._random.set_state(saved["random"])
+        torch.set_rng_state(saved["torch"])
 
 
 def _means(report: Mapping[str, Tensor], world: World) -> dict[str, float]:
@@ -167,9 +405,9 @@ def _bar_values(record: Mapping[str, Any]) -> dict[str, str]:
     return shown | {"wait": f"{record['data_wait_share']:.0%}"}
 
 
-def _health_images(val: LoadedSplit) -> Tensor:
+def _collapse_check_images(val: LoadedSplit) -> Tensor:
     """Up to 12 images, of as many shapes as there are."""
-    count = min(_HEALTH_IMAGES, len(val) * val.views)
+    count = min(_COLLAPSE_CHECK_IMAGES, len(val) * val.views)
     numbers = torch.arange(count)
     shapes = numbers % len(val)
     views = (numbers // len(val) + shapes) % val.views
@@ -179,8 +417,8 @@ def _health_images(val: LoadedSplit) -> Tensor:
 def _check_fits(config: FitConfig, train: LoadedSplit, world: World) -> None:
     if not config.phases:
         raise UserError("nothing to train: every phase has 0 steps")
-    if world.size > 1 and config.system == "lin":
-        raise UserError("--system lin cannot be shared by processes: its batch norms need the whole batch")
+    if world.size > 1 and (reason := get_method(config.system).needs_whole_batch):
+        raise UserError(f"--system {config.system} cannot run on several processes: {reason}")
     wanted_views = max(stage.views for stage in config.stages)
     if train.views < wanted_views:
         raise UserError(

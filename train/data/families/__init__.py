@@ -32,7 +32,7 @@ FAMILIES: dict[str, Family] = {
     "telephone": TELEPHONE,
     "watercraft": WATERCRAFT,
 }
-"""In the order in which they joined: an object's random stream knows its family by this number."""
+"""In the order in which they were added: the random stream of an object is seeded with its family's number."""
 
 AMBIGUOUS = tuple(name for name, family in FAMILIES.items() if family.cone)
 """The families whose front hides one of several backs."""

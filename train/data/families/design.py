@@ -1,6 +1,6 @@
-"""What a family of objects is: a front drawn from one random stream, and backs drawn from another.
+"""`Family`, a kind of procedural object: a front drawn from one random stream, and backs drawn from another.
 
-World units, y up, the front at +z; nothing is normalised by what is hidden: the image's scale would tell.
+World units, y up, the front at +z. Nothing is scaled by the extent of hidden parts: the image's scale would reveal it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Cone:
 
     @property
     def eye(self) -> tuple[float, float, float]:
-        """The position of the outermost eye, a little further out than any that looks."""
+        """A camera position slightly outside of the cone, for a margin."""
         azimuth, elevation = np.radians(self.azimuth_deg), np.radians(self.elevation_deg)
         return (
             DISTANCE * np.sin(azimuth + np.radians(2)),
@@ -38,11 +38,11 @@ class Cone:
 
 @dataclasses.dataclass(frozen=True)
 class Design:
-    """One object: what the visible stream decided.
+    """One object, as the visible stream has drawn it.
 
     Attributes:
-        parts: all that the front shows.
-        back: draws what is behind, from the hidden stream and the mode; None where nothing is hidden by design.
+        parts: everything that is visible from the front.
+        back: draws the parts behind, from the hidden stream and the mode; None for families without designed ambiguity.
         scale: of the whole, about the origin.
     """
 
@@ -62,7 +62,7 @@ class Family:
 
     Attributes:
         design: one object from a random generator, which also decides every colour.
-        cone: the views from which the front hides the back; None for a family without designed ambiguity.
+        cone: the views from which the front hides the back; None for families without designed ambiguity.
     """
 
     design: Callable[[np.random.Generator], Design]
@@ -76,13 +76,13 @@ class Family:
 
 @dataclasses.dataclass(frozen=True)
 class Plate:
-    """A solid front, and the shadow that it casts for the eyes of a cone.
+    """A solid front, and the region behind it that it hides from all cameras of a cone (its "shadow").
 
     Attributes:
         width: along x, centred at x = 0.
         low, high: along y.
         z: of its back.
-        cone: where the eyes are.
+        cone: the positions of the cameras.
     """
 
     width: float
@@ -94,9 +94,9 @@ class Plate:
     margin = 0.012
 
     def shadow(self, depth: float) -> tuple[float, float, float]:
-        """Width, low and high of what stays hidden `depth` behind the plate.
+        """Width, low and high of the hidden region at `depth` behind the plate.
 
-        The shadow narrows by the slope of the sight line over the plate's edge.
+        It narrows by the slope of the sight line over the plate's edge.
         """
         eye_x, eye_y, eye_z = self.cone.eye
         reach = depth / (eye_z - self.z)
@@ -105,7 +105,7 @@ class Plate:
 
 
 SHARP = 60.0
-"""The squareness of a section that is a rectangle to the eye."""
+"""The squareness of a section that looks like a rectangle."""
 
 
 def shadow_body(
@@ -119,16 +119,16 @@ def shadow_body(
     stands: bool = False,
     tall: float = 1.0,
 ) -> list[Solid]:
-    """A tapered body behind a plate and inside its shadow; nothing where the depth is 0.
+    """A tapered body behind a plate and hidden by it; no body if the depth is 0.
 
     Args:
-        hidden: decides size and taper.
-        depth: how far it reaches back, at most.
-        plate: what hides it.
+        hidden: draws size and taper.
+        depth: its length, at most.
+        plate: the front that hides it.
         colour: of the body.
         squareness: of the plate's outline, which the body must not exceed.
         sections: squareness of the body, one of these.
-        stands: the body keeps to the plate's lower edge.
+        stands: the body stands at the height of the plate's lower edge.
         tall: the body's height, as a share of the shadow's.
     """
     if depth == 0:
@@ -152,7 +152,7 @@ def shadow_body(
 
 
 def colours(visible: np.random.Generator) -> list[np.ndarray]:
-    """Main, second and body colour; the body's is a shade of the second, so it too is the visible stream's."""
+    """Main, second and body colour; the body's is a shade of the second, so the hidden stream draws no colour."""
     main, second = (
         np.array(
             colorsys.hsv_to_rgb(visible.random(), visible.uniform(0.1, 0.8), visible.uniform(0.35, 0.95))

@@ -14,12 +14,12 @@ from models import Predictor
 from train.config import FitConfig, InferenceConfig, StageConfig, Supervision, fit_config_from_json
 from train.data.batches import Batch, LoadedSplit
 from train.evaluation.metrics import cloud_errors, in_silhouette, visible_error
-from train.evaluation.per_shape import answers, joined, one_view_each
+from train.evaluation.per_shape import concatenate, one_view_each, sample_predictions
 from train.evaluation.runs import read_metrics
 from train.experiments.statistics import spread
 from train.experiments.store import Metrics
 from train.experiments.study import Study
-from train.methods.systems import size_of
+from train.methods import get_method
 from train.training.trainer import STAGES
 from train.training.validation import validate
 
@@ -81,7 +81,7 @@ class Training:
             }
         every = max(1, changes["stage2"].steps // 4)
         return dataclasses.replace(
-            config, **changes, min_image_sensitivity=0.0, validate_every=every, health_every=every,
+            config, **changes, min_image_sensitivity=0.0, validate_every=every, collapse_check_every=every,
             validation_shapes=min(16, config.validation_shapes),
         )  # fmt: skip
 
@@ -114,8 +114,8 @@ def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> Metrics:
     that it sees (1: as dense as behind); "imbalance": which share of the points would have to move to another of 32
     parts of the surface for all parts to be as dense (0 to 1).
     """
-    answered = answers(model, test, codes=1, seed=seed)
-    return joined(
+    answered = sample_predictions(model, test, codes=1, seed=seed)
+    return concatenate(
         [single_view_metrics(made[0], test.points[shapes], shown) for shapes, shown, made in answered]
     )
 
@@ -227,14 +227,14 @@ def _floor(study: Study) -> dict[str, float]:
     """The metrics of as many points of the true surface as a network predicts."""
     config = configs(study)[0]
     test = study.split(config, "test")
-    count = size_of(config).points
+    count = get_method(config.system).network_config(config).points
     generator = torch.Generator().manual_seed(0)
     some = torch.stack([torch.randperm(test.points.shape[1], generator=generator)[:count] for _ in test.ids])
     found = [
         single_view_metrics(test.clouds(shapes, some[shapes]), test.points[shapes], shown)
         for shapes, shown in one_view_each(test, 0)
     ]
-    return {name: values.mean().item() for name, values in joined(found).items()}
+    return {name: values.mean().item() for name, values in concatenate(found).items()}
 
 
 def _single(study: Study, training: Training) -> dict[str, Any]:
@@ -265,8 +265,8 @@ def _measured(study: Study, config: FitConfig, stage: Literal[1, 2]) -> dict[str
     alone = study.measure(
         config, "single views", lambda m, d: single_views(m, d, seed=config.seed), stage=stage
     )
-    joined = study.reconstruction_metrics(config, _RANDOM, stage=stage, views=_VIEWS)
-    both = {**alone, "cd": joined["cd"], "fps_cd": joined["fps_cd"]}
+    concatenate = study.reconstruction_metrics(config, _RANDOM, stage=stage, views=_VIEWS)
+    both = {**alone, "cd": concatenate["cd"], "fps_cd": concatenate["fps_cd"]}
     return {name: values.mean().item() for name, values in both.items()}
 
 

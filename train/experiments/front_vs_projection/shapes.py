@@ -18,14 +18,14 @@ import torch
 from torch import Tensor
 
 from diffpoint import PinholeCamera
-from train.data import ShapeTree, store
+from train.data import ShapeTree, tree_files
 from train.data.categories import category_of
+from train.data.mesh_sources import MeshFile, find_meshes, read_labels, shape_ids
 from train.data.meshes import MeshError, load_surface
 from train.data.procedural import variants_of
 from train.data.render import Renderer, orbit_camera
 from train.data.shrink import decimate_depth
 from train.data.solids import sample_union, surface_of
-from train.data.sources import MeshFile, find_meshes, read_labels, shape_ids
 from train.data.surface import sample_triangles
 from train.errors import UserError
 
@@ -141,7 +141,7 @@ def shapes_of(data: Sequence[Path], *, limit: int) -> list[StudyShape]:
     Raises:
         UserError: a path that is neither, or nothing usable in it.
     """
-    trees = [path for path in data if (path / store.RENDERS).is_dir()]
+    trees = [path for path in data if (path / tree_files.RENDERS).is_dir()]
     sources = [path for path in data if path not in trees]
     shapes = [shape for tree in trees for shape in _of_tree(tree, limit)]
     if sources:

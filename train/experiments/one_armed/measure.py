@@ -18,8 +18,8 @@ from tqdm import tqdm
 
 from train.config import FitConfig
 from train.data import ShapeTree
+from train.data.ambiguity_check import ambiguous_object
 from train.data.categories import SYNSET_OF
-from train.data.rules import hider_of
 from train.errors import UserError
 from train.evaluation.inference import reconstruct
 from train.evaluation.metrics import cloud_errors
@@ -108,7 +108,7 @@ def _check(study: Study) -> None:
             f"no chairs to train on in {', '.join(map(str, study.data))}; make some with: python -m train data "
             "procedural --out DIR"
         )
-    if any(hider and hider.seed[0] == SEED for hider in map(hider_of, trained)):
+    if any(hider and hider.seed[0] == SEED for hider in map(ambiguous_object, trained)):
         raise UserError(
             f"a tree was made with --seed {SEED}, which this experiment reserves for chairs that no network has seen; "
             "make it with another seed"
@@ -141,7 +141,7 @@ def _predict(study: Study, config: FitConfig, chairs: list[OneArmedChair], size:
         images = pictures.permute(0, 1, 4, 2, 3).float() / 255
         points = reconstruct(model, images, seed=config.seed, settings=config.inference).points
         found[arms] = points.unflatten(1, (2, -1)).contiguous()
-        if not model.config.deterministic:
+        if model.takes_codes:
             with torch.no_grad():
                 found[f"{arms}, codes"] = model(images[:, 0], codes).transpose(0, 1).contiguous()
     return found

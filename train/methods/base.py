@@ -1,0 +1,234 @@
+"""What a method is: a network, the recipe of its training, a loss for each phase, and its oracle.
+
+One file of this folder holds one method (or a family of them); `train/methods/__init__.py` lists them. The trainer
+(train/training/trainer.py) takes the same step with all of them: draw a batch, ask the method for its loss, descend.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from models import Autoencoder, Critic, Predictor
+from train.config import FitConfig, InferenceConfig, StageConfig
+from train.data.batches import Targets
+from train.distributed import SINGLE, World
+from train.errors import UserError
+from train.timer import Timer
+
+
+class Noise(NamedTuple):
+    """The random numbers of one step.
+
+    Attributes:
+        codes: (R, B*V, code_dim) from N(0, 1): the latent codes z, which the paper calls r.
+        mix: (n, R, B*V) from U(0, 1): for each of n critic steps, where between a predicted and a real latent the
+            gradient penalty is measured. Empty without a critic.
+    """
+
+    codes: Tensor
+    mix: Tensor
+
+
+@dataclasses.dataclass
+class TrainState:
+    """Everything that a step changes: networks and their optimisers."""
+
+    network: Predictor
+    """The network that predicts shapes."""
+    optimiser: torch.optim.Optimizer
+    """Of the network that the current phase trains: `network`, or the auto-encoder."""
+    autoencoder: Autoencoder | None = None
+    """Frozen while `network` is trained; None for methods that have none."""
+    critic: Critic | None = None
+    critic_optimiser: torch.optim.Optimizer | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """Which step is taken, and the tools of the trainer that a loss may need."""
+
+    phase: Any
+    """The phase's settings: `StageConfig`, or `PretrainConfig` for the auto-encoder."""
+    number: int
+    """Number of this step within the phase, for schedules."""
+    timer: Timer = dataclasses.field(default_factory=Timer)
+    world: World = SINGLE
+
+
+Loss = Callable[[TrainState, Any, Noise, Step], dict[str, Tensor]]
+"""(state, batch, noise, step) -> scalars for the log, of which "loss" is minimised.
+
+The batch is a `train.data.batches.Batch`; for an auto-encoder it is a tensor of clouds (B, N, 3).
+"""
+
+
+class Method(ABC):
+    """The interface of a method.
+
+    Attributes:
+        name: the value of `fit --system` that selects it.
+        losses: phase name -> loss. Phases are "autoencoder", "stage1" and "stage2", in this order.
+        sizes: profile -> configuration of the network.
+        network_class: class of the network; built from one of `sizes`.
+        weights_key: name of that class in the header of weights files.
+        uses_targets: do the losses need more than the views of the batch, that is, `Batch.targets`?
+        needs_whole_batch: why several processes cannot share a batch; empty if they can.
+    """
+
+    losses: ClassVar[Mapping[str, Loss]]
+    sizes: ClassVar[Mapping[str, Any]]
+    network_class: ClassVar[type[Predictor]]
+    weights_key: ClassVar[str]
+    uses_targets: ClassVar[bool] = True
+    needs_whole_batch: ClassVar[str] = ""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    @abstractmethod
+    def recipe(self, profile: str) -> FitConfig:
+        """The configuration of a training with the profile "full", "cpu" or "smoke"."""
+
+    @abstractmethod
+    def build(self, config: FitConfig) -> Predictor:
+        """The network of a configuration, with freshly drawn weights."""
+
+    def oracle(self, network: Predictor, targets: Targets) -> Tensor | None:
+        """What the network would predict if it had learnt its targets without error: the best of its representation.
+
+        Returns:
+            (B, N, 3) points in the world frame, or None where a method has no such upper limit.
+        """
+        return None
+
+    def network_config(self, config: FitConfig) -> Any:
+        """The configuration of the network that a training configuration builds."""
+        return self.sizes[config.profile]
+
+    def image_size(self, config: FitConfig) -> tuple[int, int]:
+        """Height and width in pixels of the network's input."""
+        size = self.network_config(config)
+        return size.image_height, size.image_width
+
+    def cloud_size(self, config: FitConfig) -> int:
+        """Points of one prediction, or to how many predictions are thinned for comparisons."""
+        return self.network_config(config).points
+
+    def recipe_of(self, network: Predictor) -> FitConfig:
+        """The recipe to assume for a network that comes without the configuration of its training."""
+        return self.recipe(network.profile)
+
+    def check(self, config: FitConfig) -> None:
+        """Refuses settings that the method does not have.
+
+        Raises:
+            UserError: names the settings and says how to mend them.
+        """
+        name = f"--system {self.name}"
+        if any((stage.supervision, stage.visibility) != ("front", "zbuffer") for stage in config.stages):
+            raise UserError(
+                f"{name} has a loss of its own; do not set --stage*.supervision or --stage*.visibility"
+            )
+        if config.needs_autoencoder or config.deterministic or config.variant != "standard":
+            raise UserError(
+                f"{name} does not support a critic, the latent output head, the deterministic counterpart or variants; "
+                "do not set --output-head, --deterministic, --variant or --stage*.gamma"
+            )
+        if config.precision != "float32":
+            raise UserError(f"{name} computes in float32; do not set --precision")
+        if missing := set(config.phases) - set(self.losses):
+            raise UserError(f"{name} has no {', '.join(sorted(missing))}; leave its steps at 0")
+
+    def new_state(self, config: FitConfig) -> TrainState:
+        """Networks with freshly drawn weights, and their optimisers."""
+        network = self.build(config)
+        return TrainState(network, adam(network))
+
+    def begin_phase(self, state: TrainState, phase: str) -> None:
+        """Prepares the networks for a phase, once the weights that it starts from are loaded."""
+        return
+
+
+def adam(network: nn.Module, *, weight_decay: float = 0.0) -> torch.optim.Adam:
+    """Adam over the parameters that are not frozen; its step size is set at every step."""
+    return torch.optim.Adam(trainable(network), fused=True, weight_decay=weight_decay)
+
+
+def trainable(network: nn.Module) -> list[nn.Parameter]:
+    """The parameters that are not frozen."""
+    return [parameter for parameter in network.parameters() if parameter.requires_grad]
+
+
+def set_learning_rate(optimiser: torch.optim.Optimizer, learning_rate: float) -> None:
+    """Sets the step size of all of an optimiser's parameters."""
+    for group in optimiser.param_groups:
+        group["lr"] = learning_rate
+
+
+def check_finite(values: Tensor, what: str, step: Step) -> None:
+    """Ends a training whose numbers are no longer finite.
+
+    Raises:
+        UserError: some value is NaN or infinite.
+    """
+    if not values.detach().isfinite().all():
+        raise UserError(
+            f"stopped at step {step.number} of the stage: {what} no longer finite; lower the learning rate"
+        )
+
+
+# What the recipes of all methods share. By the paper's 30 inference steps of 0.5 the views of a network as small as cpu
+# agree at the expense of coverage: CD +0.29, FPS-CD -0.05 against random codes at 8 views; 10 steps of 0.1: +0.02 and
+# -0.11, on other shapes +0.08 and -0.05 (docs/results.md). With two images the gradient of a pair is four times as long
+# as with eight, and one shape in 264 got worse in the end: the codes with the lowest loss on the way are kept.
+RUN_SETTINGS: dict[str, dict[str, Any]] = {
+    "full": {
+        "profile": "full", "map_size": 56, "validate_every": 2_000, "validation_shapes": 200, "checkpoint_every": 1_000,
+        "collapse_check_every": 500, "collapse_patience": 8_000, "picture_every": 5_000,
+    },
+    "cpu": {
+        "profile": "cpu", "inference": InferenceConfig(steps=10, step_size=0.1, keep_best=True),
+    },
+    "smoke": {
+        "profile": "smoke", "map_size": 16, "inference": InferenceConfig(groups=2, steps=3), "validate_every": 10,
+        "validation_shapes": 4, "checkpoint_every": 10, "collapse_check_every": 10, "collapse_patience": 10_000,
+        "log_every": 1, "picture_every": 25,
+    },
+}  # fmt: skip
+
+
+def plain_stage(**settings: Any) -> StageConfig:
+    """A stage as most methods need it: one image of each shape, one code, no diversity loss, no critic.
+
+    Args:
+        settings: fields of `StageConfig` that differ; "rate" sets a constant learning rate, a pair of numbers the first
+            and the last of a cosine.
+    """
+    rate = settings.pop("rate")
+    first, final = rate if isinstance(rate, tuple) else (rate, rate)
+    defaults: dict[str, Any] = {
+        "views": 1, "codes": 1, "joined_views": False, "front": "chamfer", "alpha": 0.0, "beta": 0.0,
+        "diversity_images": 1, "diversity_stride": 1, "ramp": (0, 1), "select": "cd",
+        "learning_rate": first, "final_learning_rate": final,
+    }  # fmt: skip
+    return StageConfig(**(defaults | settings))
+
+
+def plain_recipe(
+    name: str, profile: str, stage1: StageConfig, stage2: StageConfig | None = None, **settings: Any
+) -> FitConfig:
+    """A recipe of `plain_stage`s; a method with one phase has a stage 2 of no steps.
+
+    Predictions are made without search and descent on codes, and each view is evaluated by itself, if `settings` do not
+    change it.
+    """
+    stage2 = stage2 or dataclasses.replace(stage1, steps=0)
+    without_codes = {"inference": InferenceConfig(groups=1, steps=0, scored="each")}
+    settings = {**RUN_SETTINGS[profile], "system": name, **without_codes, **settings}
+    return FitConfig(stage1, stage2, **settings)
