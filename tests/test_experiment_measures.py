@@ -38,7 +38,7 @@ from train.evaluation.runs import load_autoencoder, read_metrics
 from train.experiments.agreement import SETTINGS
 from train.experiments.collapse import VARIANTS
 from train.experiments.correlation import correlate, pearson, spearman
-from train.experiments.coverage import hidden_distances, make_object, near_distance, reach
+from train.experiments.coverage import APART, hidden_distances, make_object, reach
 from train.experiments.hidden_points import Rays, Scene, embedded_scene, make_scene, quality
 from train.experiments.one_armed.chairs import (
     HIDDEN,
@@ -148,7 +148,7 @@ def test_coverage_is_measured_and_drawn(study: Study, monkeypatch: pytest.Monkey
 
 def test_backs_cover_themselves_and_nothing_else_does() -> None:
     obj = make_object(Hider("loudspeaker", (0, 2)), 64)
-    near = near_distance(obj.backs, obj.again)
+    near = obj.limits[APART]
     assert reach(hidden_distances(obj.backs, obj.backs), near) == (1, 0)
     assert reach(hidden_distances(obj.again[:, :1024].contiguous(), obj.backs), near) == (1, 0)
     one = hidden_distances(obj.backs[1:2].expand(4, -1, -1).contiguous(), obj.backs)

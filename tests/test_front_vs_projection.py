@@ -126,6 +126,9 @@ def test_free_clouds_are_fitted_once_and_repeat_themselves(tmp_path: Path, monke
     lost = next(path for path in cells if path.name.startswith("embedded_chair"))
     before = {path: path.stat().st_mtime_ns for path in cells}
     lost.unlink()
+    monkeypatch.setattr(
+        experiment.page, "draw", lambda *_, **__: {}
+    )  # takes seconds, and fits nothing that is kept
     again, _ = experiment.free_clouds(study, settings=(ONE,))
     assert _numbers(again) == _numbers(found)
     assert {path for path in cells if path.stat().st_mtime_ns != before[path]} == {lost}
@@ -176,9 +179,7 @@ def test_networks_are_trained_measured_and_resumed(
     networks = run_experiment("front-vs-projection", study)["networks"]
     assert list(networks["single"]) == list(TRAININGS)
     assert "horizon" not in networks["many"]
-    assert (
-        len(list((tmp_path / "runs").iterdir())) == sum(1 + bool(c.stage1.steps) for c in configs(study)) == 8
-    )
+    assert len(list((tmp_path / "runs").iterdir())) == len(configs(study)) == 5
     front, horizon = (networks["single"][name]["stage1"] for name in ("front", "horizon"))
     assert front["visible"]["by_seed"] != horizon["visible"]["by_seed"]
     curve = networks["single"]["front"]["curves"][0]
