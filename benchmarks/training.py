@@ -1,7 +1,6 @@
-"""Where a training step's time goes, and the same step with the plain twins of `diffpoint.reference`.
+"""Where a training step's time goes, and the same step with the implementations of `diffpoint.reference`.
 
-The data are made up and lie in memory: reading files is no part of a step. Predictions are those of a network that has
-made a few steps.
+The data are synthetic and in memory, without reading of files. Predictions are those of a network after a few steps.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from train.state import Training
 _SHAPES, _VIEWS = 16, 8
 _STEPS = {"smoke": (5, 10), "cpu": (5, 8), "full": (1, 2)}
 """Steps to warm up, and steps to measure."""
-_TWINS = ("smoke", "cpu")  # with the full profile, the twins' matrices would not fit the memory
+_SMALL = ("smoke", "cpu")  # with the full profile, the matrices of the reference would not fit into memory
 
 
 def measure(*, quick: bool = False) -> Iterator[dict[str, Any]]:
@@ -37,19 +36,19 @@ def measure(*, quick: bool = False) -> Iterator[dict[str, Any]]:
         config = PROFILES[profile]
         training = Training(config, _data(config))
         for name in ("stage1", "stage2"):
-            training._enter(name)  # begin_phase would look for the weights of the phase before
+            training._enter(name)  # begin_phase would load the weights of the phase before
             stage = training.phase
             assert isinstance(stage, StageConfig)
             warm, steps = _STEPS[profile]
-            # Where the diversity loss has its full weight, and the step size is small enough to stay put.
+            # The diversity loss has its full weight, and the step size is small.
             training.step = min(stage.ramp[1] + 1, stage.steps - 1)
             row = {"profile": profile, "stage": name[-1], **_shares(training, warm, 2 if quick else steps)}
-            if profile in _TWINS:
-                with twins():
-                    row["twins_ratio"] = 1e3 * _seconds(training.advance) / row["ms"]
+            if profile in _SMALL:
+                with on_reference():
+                    row["reference_ratio"] = 1e3 * _seconds(training.advance) / row["ms"]
                 if optimize := optional("scipy.optimize"):
                     solve = optimize.linear_sum_assignment
-                    with twins(lambda cost, solve=solve: torch.from_numpy(solve(cost)[1])):
+                    with on_reference(lambda cost, solve=solve: torch.from_numpy(solve(cost)[1])):
                         row["scipy_ratio"] = 1e3 * _seconds(training.advance) / row["ms"]
             parts = ", ".join(f"{part} {share:.0%}" for part, share in row["shares"].items())
             print(f"  {profile}, stage {row['stage']}: {row['ms']:.0f} ms a step ({parts})", flush=True)
@@ -120,11 +119,11 @@ def _data(config: FitConfig) -> LoadedSplit:
 
 
 @contextlib.contextmanager
-def twins(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
+def on_reference(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
     """Within, the losses of training run on `diffpoint.reference`.
 
     Args:
-        assign: instead of the twin's own search for the best assignment, which takes a second a pair.
+        assign: replaces the assignment of the reference, which takes a second a pair.
     """
     from diffpoint import losses
     from train import objective, step
@@ -144,7 +143,7 @@ def twins(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
     def earth_mover_distance(
         a: Tensor, b: Tensor, *, tolerance: float = 0.0, enough: Tensor | None = None, **lengths: Tensor
     ) -> dp.Transport:
-        del tolerance, enough  # the twin is exact
+        del tolerance, enough  # the reference is exact
         cost, assignment = reference.earth_mover_distance(a, b, **lengths)
         prices = a.new_zeros((*cost.shape, max(a.shape[-2], b.shape[-2])))
         converged = torch.ones_like(cost, dtype=torch.bool)
