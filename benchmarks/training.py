@@ -1,7 +1,7 @@
-"""Where a training step's time goes, and the same step with the plain twins of `diffpoint.reference`.
+"""Where a training step's time goes, and the same step with the reference implementations of `diffpoint.reference`.
 
-The data are made up and lie in memory: reading files is no part of a step. Predictions are those of a network that has
-made a few steps.
+The data are generated in memory: reading files is not part of a step. Predictions are those of a network that has made
+a few steps.
 """
 
 from __future__ import annotations
@@ -19,70 +19,73 @@ from torch import Tensor
 import diffpoint as dp
 from benchmarks.inputs import surfaces
 from benchmarks.peers import optional
-from diffpoint import reference
+from diffpoint import losses, reference
 from models import PROFILES as SIZES
-from train.config import PROFILES, FitConfig, StageConfig
+from train.config import FitConfig, StageConfig
 from train.data.batches import LoadedSplit
-from train.training.state import Training
+from train.methods import losses as train_losses
+from train.methods import recipe
+from train.training.trainer import Trainer
 
 _SHAPES, _VIEWS = 16, 8
 _STEPS = {"smoke": (5, 10), "cpu": (5, 8), "full": (1, 2)}
 """Steps to warm up, and steps to measure."""
-_TWINS = ("smoke", "cpu")  # with the full profile, the twins' matrices would not fit the memory
+_WITH_REFERENCE = (
+    "smoke",
+    "cpu",
+)  # with the full profile, the matrices of the reference would not fit the memory
 
 
 def measure(*, quick: bool = False) -> Iterator[dict[str, Any]]:
     """A row for both stages of each profile."""
     for profile in ("smoke", "cpu") if quick else ("smoke", "cpu", "full"):
-        config = PROFILES[profile]
-        training = Training(config, _data(config))
+        config = recipe("ours", profile)
+        trainer = Trainer(config, _data(config))
         for name in ("stage1", "stage2"):
-            training._enter(name)  # begin_phase would look for the weights of the phase before
-            stage = training.phase
+            trainer.enter_phase(name)
+            stage = trainer.phase
             assert isinstance(stage, StageConfig)
             warm, steps = _STEPS[profile]
-            # Where the diversity loss has its full weight, and the step size is small enough to stay put.
-            training.step = min(stage.ramp[1] + 1, stage.steps - 1)
-            row = {"profile": profile, "stage": name[-1], **_shares(training, warm, 2 if quick else steps)}
-            if profile in _TWINS:
-                with twins():
-                    row["twins_ratio"] = 1e3 * _seconds(training.advance) / row["ms"]
+            # Where the diversity loss has its full weight, and the learning rate is small enough to change little.
+            trainer.step = min(stage.ramp[1] + 1, stage.steps - 1)
+            row = {"profile": profile, "stage": name[-1], **_shares(trainer, warm, 2 if quick else steps)}
+            if profile in _WITH_REFERENCE:
+                with reference_ops():
+                    row["twins_ratio"] = 1e3 * _seconds(trainer.train_step) / row["ms"]
                 if optimize := optional("scipy.optimize"):
                     solve = optimize.linear_sum_assignment
-                    with twins(lambda cost, solve=solve: torch.from_numpy(solve(cost)[1])):
-                        row["scipy_ratio"] = 1e3 * _seconds(training.advance) / row["ms"]
+                    with reference_ops(lambda cost, solve=solve: torch.from_numpy(solve(cost)[1])):
+                        row["scipy_ratio"] = 1e3 * _seconds(trainer.train_step) / row["ms"]
             parts = ", ".join(f"{part} {share:.0%}" for part, share in row["shares"].items())
             print(f"  {profile}, stage {row['stage']}: {row['ms']:.0f} ms a step ({parts})", flush=True)
             yield row
 
 
-def _shares(training: Training, warm: int, steps: int) -> dict[str, Any]:
+def _shares(trainer: Trainer, warm: int, steps: int) -> dict[str, Any]:
     """Median milliseconds of a step, and the shares of its parts."""
-    from train.methods import losses as objective
-
     for _ in range(warm):
-        training.advance()
+        trainer.train_step()
     milliseconds: list[float] = []
     parts: dict[str, list[float]] = {}
     rendering: list[float] = []
 
-    def timed(*arguments: Any) -> Any:
+    def timed(*arguments: Any, **options: Any) -> Any:
         start = time.perf_counter()
-        result = front_sets(*arguments)
+        result = front_sets(*arguments, **options)
         rendering.append(time.perf_counter() - start)
         return result
 
-    front_sets = objective.front_sets
-    with mock.patch.object(objective, "front_sets", timed):
+    front_sets = losses.front_sets
+    with mock.patch.object(losses, "front_sets", timed):
         for _ in range(steps):
             rendering.clear()
-            training.laps.begin()
-            milliseconds.append(1e3 * _seconds(training.advance))
-            laps = {k.removesuffix("_seconds"): v for k, v in training.laps.read().items()}
-            laps["splat and sample"] = sum(rendering)
-            laps["distances"] -= sum(rendering)
+            trainer.timer.reset()
+            milliseconds.append(1e3 * _seconds(trainer.train_step))
+            times = {k.removesuffix("_seconds"): v for k, v in trainer.timer.read().items()}
+            times["splat and sample"] = sum(rendering)
+            times["distances"] -= sum(rendering)
             for part in ("network", "critic", "splat and sample", "distances", "data"):
-                parts.setdefault(part, []).append(laps.get(part, 0.0))
+                parts.setdefault(part, []).append(times.get(part, 0.0))
     whole = sum(map(statistics.median, parts.values()))
     shares = {part: statistics.median(values) / whole for part, values in parts.items()}
     return {
@@ -120,15 +123,12 @@ def _data(config: FitConfig) -> LoadedSplit:
 
 
 @contextlib.contextmanager
-def twins(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
-    """Within, the losses of training run on `diffpoint.reference`.
+def reference_ops(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
+    """Within, the losses of training are computed by `diffpoint.reference`.
 
     Args:
-        assign: instead of the twin's own search for the best assignment, which takes a second a pair.
+        assign: replaces the reference's own search for the best assignment, which takes a second a pair.
     """
-    from diffpoint import losses
-    from train.methods import losses as objective
-    from train.methods import step
 
     def visible_points(points: Tensor, camera: dp.PinholeCamera, **_: Any) -> Tensor:
         return reference.splat_depth(points, camera.K, camera.cam_from_world, camera.height, camera.width)[2]
@@ -145,7 +145,7 @@ def twins(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
     def earth_mover_distance(
         a: Tensor, b: Tensor, *, tolerance: float = 0.0, enough: Tensor | None = None, **lengths: Tensor
     ) -> dp.Transport:
-        del tolerance, enough  # the twin is exact
+        del tolerance, enough  # the reference is exact
         cost, assignment = reference.earth_mover_distance(a, b, **lengths)
         prices = a.new_zeros((*cost.shape, max(a.shape[-2], b.shape[-2])))
         converged = torch.ones_like(cost, dtype=torch.bool)
@@ -154,7 +154,7 @@ def twins(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator[None]:
     replacements = [visible_points, sample_view, unproject, chamfer_distance, earth_mover_distance]
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(reference, "assign", assign))
-        for module in (losses, objective, step):
+        for module in (losses, train_losses):
             for function in replacements:
                 if hasattr(module, function.__name__):
                     stack.enter_context(mock.patch.object(module, function.__name__, function))

@@ -33,7 +33,7 @@ BIAS = {bias:.3f}
 FILTERS: tuple[tuple[float, ...], ...] = (
 {rows}
 )
-"""Per filter: 8 weights, one for each sector; a bias; what its mean and its maximum over 8 rotations count."""
+"""Per filter: 8 weights, one for each sector; a bias; the weights of its mean and its maximum over 8 rotations."""
 '''
 
 

@@ -1,4 +1,4 @@
-"""Which compiler runs the kernels: the one rule, and its import."""
+"""The choice between the compilers Taichi and Quadrants, and its import."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def backend_name() -> str:
 
 
 def import_backend() -> ModuleType:
-    """The module of `backend_name`, imported without its greeting."""
+    """The module of `backend_name`, imported without its messages."""
     name = backend_name()
     if name not in sys.modules:
         for backend in BACKENDS:

@@ -1,4 +1,4 @@
-"""The one crossing between torch and Taichi, and the one way an op is registered with torch."""
+"""Calls from torch into the Taichi kernels, and the registration of ops with torch. Nothing else does either."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def launch(module: str, kernel: str, real: torch.dtype, *arguments: Tensor | int
     caller's tensor would stay as it was. `register` makes the arguments of an op contiguous.
 
     Raises:
-        ValueError: a tensor that is not contiguous, or one of 2^31 elements or more, which the kernels' 32-bit
-            offsets cannot reach.
+        ValueError: a tensor that is not contiguous, or one of 2^31 elements or more, beyond the
+            kernels' 32-bit offsets.
     """
     for position, a in enumerate(arguments):
         if not isinstance(a, Tensor):
             continue
         if a.numel() > _LARGEST:
             raise ValueError(
-                f"diffpoint: a tensor of shape {tuple(a.shape)} is too large for the kernels, which count to 2^31 "
-                "elements. Split the batch."
+                f"diffpoint: a tensor of shape {tuple(a.shape)} is too large for the kernels, whose offsets are 32-bit "
+                "integers (at most 2^31 - 1 elements). Split the batch."
             )
         if not a.is_contiguous():
             name = RUNTIME.argument_name(module, kernel, position)
@@ -54,10 +54,10 @@ def register(
 ) -> Callable:
     """Decorator: register a function of tensors as the torch operator `diffpoint::<name>`.
 
-    `fake` gives the outputs' shapes without computing, `backward` and `setup` are the autograd formula. An op
-    without a formula refuses to be differentiated, by its name. The function itself sees contiguous CPU tensors only:
-    others are copied before it, and its results moved back after it, so that the gradient's op moves its own. With
-    `strided` the function also takes tensors that are not contiguous, for instance one number expanded.
+    `fake` gives the outputs' shapes without computing, `backward` and `setup` are the autograd formula. Differentiating
+    an op without a formula raises an error with its name. The function receives contiguous CPU tensors: arguments on
+    other devices or with other strides are copied first, and the results are moved to the device of the arguments.
+    With `strided` it also receives tensors that are not contiguous, for instance one number expanded.
     """
 
     def decorate(function: Callable) -> Callable[..., Any]:
@@ -91,10 +91,10 @@ def _on_cpu_tensors(function: Callable, strided: bool) -> Callable:
 
 
 def or_zeros(gradient: Tensor | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """What flows back to an output: one zero, expanded, where nothing does.
+    """The gradient of an output, or one zero expanded to `shape` if there is none.
 
-    For ops that call `ctx.set_materialize_grads(False)`: torch would otherwise fill a tensor with zeros for every
-    output without a gradient, indices and flags included.
+    For ops that call `ctx.set_materialize_grads(False)`: otherwise torch fills a tensor with zeros for every output
+    without a gradient, indices and flags included.
     """
     return like.new_zeros(()).expand(shape) if gradient is None else gradient
 

@@ -1,4 +1,4 @@
-"""One style of error: `function: 'argument' must ...; got ...; how to mend it`."""
+"""Checks of arguments. Their errors read: `function: 'argument' must ...; got ...; how to fix it`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FLOATS = (torch.float32, torch.float64)
 
 
 def fail(function: str, argument: str, expected: str, got: str, hint: str = "") -> ValueError:
-    """The error every check raises, so that all of them read alike."""
+    """The error that the checks raise, in one format."""
     return ValueError(f"{function}: '{argument}' must {expected}; got {got}." + (f" {hint}" if hint else ""))
 
 
@@ -29,7 +29,7 @@ def check_tensor(function: str, name: str, value: Any, shape: tuple[int | str, .
 
 
 def check_device(function: str, name: str, value: Tensor, like: Tensor) -> None:
-    """The tensors of a call live on one device. Which one is free: the ops move theirs to the CPU and back."""
+    """All tensors of a call are on one device, which may be any: the ops copy to the CPU and back."""
     if value.device != like.device:
         raise ValueError(
             f"{function}: '{name}' must be on the device of the other arguments ({like.device}); "
@@ -51,7 +51,7 @@ def check_shape(
 
 
 def check_same_dtype(function: str, **tensors: Tensor) -> torch.dtype:
-    """All of them share one dtype, and one device."""
+    """All tensors have one dtype and are on one device."""
     (first_name, first), *rest = tensors.items()
     for name, value in rest:
         if value.dtype != first.dtype:
@@ -65,7 +65,7 @@ def check_same_dtype(function: str, **tensors: Tensor) -> torch.dtype:
 def check_lengths(
     function: str, name: str, lengths: Any, shape: tuple[int, ...], largest: int, like: Tensor | None = None
 ) -> Tensor | None:
-    """Lengths are integers of shape `shape` in [0, largest], beside `like`; None means that every set is full."""
+    """Lengths are integers of shape `shape`, on the device of `like`; None means that every set is full."""
     if lengths is None:
         return None
     if not isinstance(lengths, torch.Tensor) or lengths.dtype not in (torch.int64, torch.int32):
@@ -79,7 +79,7 @@ def check_lengths(
 
 
 def check_lengths_range(function: str, name: str, lengths: Tensor, largest: int, smallest: int = 0) -> None:
-    """Reads the values, so it belongs where the values exist (inside the op, not under a compiler's trace)."""
+    """Reads values, so call it inside an op and not while torch traces."""
     if lengths.numel() == 0:
         return
     low, high = (int(v) for v in torch.aminmax(lengths))
@@ -91,7 +91,7 @@ def check_lengths_range(function: str, name: str, lengths: Tensor, largest: int,
 
 
 def check_finite(function: str, name: str, value: Tensor, lengths: Tensor | None = None) -> None:
-    """No NaN or infinity among the points that count. One sum first: only a suspect tensor is read twice."""
+    """No NaN or infinity among the first `lengths` points. A finite sum is enough; only else are all values read."""
     if value.numel() == 0 or math.isfinite(float(value.sum())):
         return
     bad = ~torch.isfinite(value)
@@ -111,7 +111,7 @@ def check_finite(function: str, name: str, value: Tensor, lengths: Tensor | None
 def check_sets(
     function: str, a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, *, smallest: int
 ) -> None:
-    """What two batches of sets must hold, read from their values: lengths in range, and finite coordinates."""
+    """The values of two batches of sets: lengths in range, and finite coordinates."""
     for name, cloud, lengths in (("a", a, a_lengths), ("b", b, b_lengths)):
         if cloud.shape[1] < smallest:
             raise fail(function, name, "hold at least one point", str(tuple(cloud.shape)))

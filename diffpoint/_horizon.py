@@ -16,4 +16,4 @@ FILTERS: tuple[tuple[float, ...], ...] = (
     (1.207, -0.142, -2.689, 2.468, -0.065, 0.948, -0.707, -0.031, 0.121, 2.093, 0.080),
     (-0.357, -0.207, 0.093, 0.343, -1.714, 1.148, 2.075, -2.925, -1.880, -3.035, 0.581),
 )
-"""Per filter: 8 weights, one for each sector; a bias; what its mean and its maximum over 8 rotations count."""
+"""Per filter: 8 weights, one for each sector; a bias; the weights of its mean and its maximum over 8 rotations."""

@@ -1,4 +1,4 @@
-"""Taichi's life: started on the first op and only if nobody has, never restarted, refused after a fork."""
+"""Starts Taichi at the first op unless the host program has; never restarts it, and refuses to use it after a fork."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from diffpoint._backend import BACKENDS, backend_name, import_backend
 from diffpoint._launch import FastCall
 
 # Taichi runs a parallel loop of up to 512 iterations on one thread unless it was started with other settings.
-# In a host program's Taichi every loop is therefore stretched by this factor, and acts once per stretch.
+# Where the host program started Taichi, every loop therefore has this many times the iterations, of which one in so
+# many does work.
 _HOST_SPREAD = 512
 
 
@@ -37,9 +38,9 @@ class RuntimeInfo:
     """Who started Taichi: "diffpoint", "host" or "nobody"."""
     threads: int
     cache: bool
-    """Whether compiled kernels are kept on disk for the next process."""
+    """Whether compiled kernels are cached on disk for later processes."""
     processor: str
-    """Name of the processor, as far as the system tells it: what times belong to."""
+    """Name of the processor, if the system reports it, to label measured times with."""
 
 
 class _Runtime:
@@ -53,7 +54,7 @@ class _Runtime:
         self.calls: dict[tuple[str, str, str], FastCall] = {}
 
     def current_program(self) -> Any:
-        """The running Taichi program, whoever started it; None before any."""
+        """The running Taichi program, started here or by the host; None before."""
         backend = sys.modules.get(backend_name())
         if backend is None:
             return None
@@ -63,7 +64,7 @@ class _Runtime:
         )  # quadrants' `prog` raises before a start
 
     def ensure_started(self) -> int:
-        """Start Taichi if nobody has. Returns the spread factor of parallel loops."""
+        """Start Taichi unless it runs. Returns the spread factor of parallel loops (see kernels/__init__.py)."""
         if self.forked:
             raise RuntimeError(
                 "diffpoint: this process was forked after Taichi had started, and Taichi's threads do not survive a "
@@ -77,14 +78,14 @@ class _Runtime:
 
     def _start(self) -> Any:
         ti = import_backend()
-        with contextlib.redirect_stdout(io.StringIO()):  # init announces itself on stdout
+        with contextlib.redirect_stdout(io.StringIO()):  # init prints its version
             ti.init(
                 arch=ti.cpu,
                 log_level=ti.ERROR,
                 cpu_max_num_threads=self.threads or available_threads(),
                 offline_cache=self.cache,
-                fast_math=False,  # it assumes that there is no infinity, and infinity marks empty pixels
-                # Even two iterations of a parallel loop are shared out among the threads.
+                fast_math=False,  # it would assume that there are no infinities, but empty pixels are +inf
+                # With these, a parallel loop of two iterations already runs on two threads.
                 make_cpu_multithreading_loop=False,
                 default_cpu_block_dim=1,
             )
@@ -102,19 +103,19 @@ class _Runtime:
         return self.kernels[key]
 
     def call(self, module: str, kernel: str, real: str) -> FastCall:
-        """One of these kernels, to be called without Taichi's overhead."""
+        """One of these kernels, with less overhead than Taichi's own call."""
         key = (module, kernel, real)
         if key not in self.calls:
             self.calls[key] = FastCall(getattr(self.kernel(module, real), kernel))
         return self.calls[key]
 
     def argument_name(self, module: str, kernel: str, position: int) -> str:
-        """What the kernel's source calls its argument."""
+        """Name of an argument in the kernel's source, for error messages."""
         return list(inspect.signature(getattr(self.kernel(module, "f32"), kernel)).parameters)[position]
 
 
 def available_threads() -> int:
-    """Cores this process may use."""
+    """Number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -126,7 +127,7 @@ RUNTIME = _Runtime()
 def _mark_forked() -> None:
     if any(name in sys.modules for name in BACKENDS) and RUNTIME.current_program() is not None:
         RUNTIME.forked = True
-    RUNTIME.lock = threading.RLock()  # another thread of the parent may have held it
+    RUNTIME.lock = threading.RLock()  # another thread of the parent may have held the old one
 
 
 if hasattr(os, "register_at_fork"):
@@ -134,14 +135,14 @@ if hasattr(os, "register_at_fork"):
 
 
 def configure(*, threads: int | None = None, cache: bool = True) -> None:
-    """Settings of the kernels' runtime; call it before the first op.
+    """Set how the kernels run; call it before the first op.
 
     Args:
-        threads: how many threads the kernels use; None means every core this process may use.
-        cache: keep compiled kernels on disk, so that the next process starts in a fraction of a second.
+        threads: number of threads of the kernels; None means every core that this process may use.
+        cache: cache compiled kernels on disk, so that the next process starts in a fraction of a second.
 
     Raises:
-        RuntimeError: an op has already started the kernels (Taichi cannot be started twice in a process).
+        RuntimeError: an op has run already (Taichi cannot be started twice in a process).
         ValueError: fewer than one thread.
 
     Example:
@@ -187,9 +188,9 @@ def runtime_info() -> RuntimeInfo:
         )
 
 
-@functools.cache  # `runtime_info` is asked at every splat
+@functools.cache  # `runtime_info` is called at every splat
 def _processor_name() -> str:
-    cpuinfo = Path("/proc/cpuinfo")  # Linux, where `platform` does not know the name
+    cpuinfo = Path("/proc/cpuinfo")  # on Linux `platform` does not return the name
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()

@@ -1,4 +1,4 @@
-"""Clouds in spatial order with the boxes of their parts: what lets exact searches pass over most of a large cloud."""
+"""Clouds in spatial order with bounding boxes of their parts, so that exact searches can skip most of a large cloud."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Blocks(NamedTuple):
     """A batch of clouds sorted along a Morton curve."""
 
     points: Tensor
-    """(B, N', 3) in the curve's order, N' the next multiple of 1024; the padding is infinite."""
+    """(B, N', 3) in the curve's order, N' the next multiple of 1024; infinite in the padding."""
     order: Tensor
-    """(B, N') int32: where each of them was before; a large number in the padding."""
+    """(B, N') int32: index of each point before sorting; 2^31 - 1 in the padding."""
     boxes: Tensor
-    """(B, 6, N' / 32) least and greatest corner of every 32 points."""
+    """(B, 6, N' / 32) minimum and maximum corner of every 32 points."""
     groups: Tensor
-    """(B, 6, G) the same of every 32 boxes, G the next multiple of 16; those without points are infinite."""
+    """(B, 6, G) the same of every 32 boxes, G the next multiple of 16; infinite for boxes without points."""
     size: int
-    """N"""
+    """N, the number of points before padding."""
 
     @property
     def box_lanes(self) -> Tensor:
@@ -38,7 +38,7 @@ class Blocks(NamedTuple):
 def sort_into_blocks(points: Tensor, lengths: Tensor) -> Blocks:
     """Sort clouds (B, N, 3) of the given lengths (B,); O(N) time and memory."""
     batch, size, _ = points.shape
-    # About as many cells as points: finer keys cost memory, coarser ones leave points within a cell unsorted.
+    # About as many cells as points: finer keys cost memory, with coarser ones the boxes get larger.
     bits = 2
     while bits < _MOST_BITS and 8 ** (bits + 1) <= 2 * size:
         bits += 1

@@ -1,4 +1,4 @@
-"""Pinhole cameras in the OpenCV convention, and the way between points and pixels."""
+"""Pinhole cameras in the OpenCV convention."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class PinholeCamera:
     Gradients: every method is differentiable with respect to `K` and `cam_from_world`.
 
     Raises:
-        ValueError: shapes, last rows or sizes that are no pinhole camera.
+        ValueError: shapes, last rows or sizes that do not describe a pinhole camera.
         TypeError: not a tensor, or not float32 or float64.
 
     Example:
@@ -137,7 +137,7 @@ class PinholeCamera:
     def from_pytorch3d(cls, R: Tensor, T: Tensor, K: Tensor, height: int, width: int) -> PinholeCamera:
         """From PyTorch3D's `R` (..., 3, 3), `T` (..., 3): X_view = X_world R + T, x left, y up, z forward.
 
-        `K` is the OpenCV matrix in pixels (`cameras_from_opencv_projection` is the way back).
+        `K` is the OpenCV matrix in pixels (PyTorch3D's `cameras_from_opencv_projection` is the inverse).
 
         Example:
             >>> R, T, K = torch.eye(3), torch.tensor([0.0, 0.0, 2.0]), torch.eye(3)
@@ -154,7 +154,7 @@ class PinholeCamera:
     def batch_shape(self) -> tuple[int, ...]:
         """Leading dimensions of the cameras: (), (V,) or (B, V)."""
         own, other = self.K.shape[:-2], self.cam_from_world.shape[:-2]
-        if own == other:  # broadcasting would find the same, ten microseconds later
+        if own == other:  # saves 10 us of broadcasting
             return tuple(own)
         return tuple(torch.broadcast_shapes(own, other))
 
@@ -181,7 +181,7 @@ class PinholeCamera:
         return torch.cat((rays, origin), dim=-1)
 
     def resize(self, height: int, width: int) -> PinholeCamera:
-        """The same view on a map of another size: K's first row times width ratio, the second times height ratio."""
+        """The same view on a map of another size: K's rows are scaled by the ratio of the sizes."""
         scale = self.K.new_tensor([width / self.width, height / self.height, 1.0])
         return PinholeCamera(self.K * scale[:, None], self.cam_from_world, height, width)
 
@@ -231,7 +231,7 @@ def _vector(name: str, value, like: Tensor | None = None) -> Tensor:
 
 
 class Views(NamedTuple):
-    """A camera seen as one of batch shape (B, V). Matrices are computed before they are broadcast."""
+    """A camera broadcast to batch shape (B, V). Matrices are computed before they are broadcast."""
 
     camera: PinholeCamera
     batch_shape: tuple[int, int]
@@ -250,9 +250,9 @@ class Views(NamedTuple):
 def check_views(
     function: str, name: str, camera: PinholeCamera, like: Tensor, *, views: int | None = None
 ) -> Views:
-    """The camera as (B, V) views, for B clouds or groups of maps `like`: () and (V,) are shared by all.
+    """The camera as (B, V) views, B being the first dimension of `like`; batch shapes () and (V,) are shared by all B.
 
-    With `views`, the number of depth maps of a group: it must have that many, or one for all of them.
+    `views`: the number of depth maps per item; the camera must have as many views, or one.
     """
     if not isinstance(camera, PinholeCamera):
         raise TypeError(f"{function}: '{name}' must be a PinholeCamera; got {type(camera).__name__}.")
@@ -292,4 +292,4 @@ class PointSets(NamedTuple):
     points: Tensor
     """(B, V, N, 3) world frame."""
     lengths: Tensor
-    """(B, V) int64: how many of the N are points."""
+    """(B, V) int64: how many of the N entries are points."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from diffpoint import _bridge, _checks
 from diffpoint.blocks import Blocks, sort_into_blocks
 
-# Pairs of points from which passing over boxes is faster than trying all pairs, whatever the clouds.
+# Number of pairs from which the search with boxes is faster than trying all pairs, for any clouds.
 _LARGE = 2**23
 
 
@@ -18,8 +18,8 @@ class Nearest(NamedTuple):
     """For each point of the first set, its nearest point of the second."""
 
     squared_distance: Tensor
-    """(*B, N); 0 in the padding of `a`; +inf where `b` is empty, or too far for the square to be a number (in float32
-    from 1.8e19 on)."""
+    """(*B, N); 0 in the padding of `a`; +inf where `b` is empty, or where the square overflows (in float32 from
+    distances of 1.8e19 on)."""
     index: Tensor
     """(*B, N) int64 into `b`; -1 in the padding of `a` and where the distance is infinite."""
 
@@ -36,7 +36,7 @@ class Chamfer(NamedTuple):
 def nearest(
     a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
 ) -> Nearest:
-    """d2_i = min_j |a_i - b_j|^2 and the j that attains it (the lowest of equals).
+    """d2_i = min_j |a_i - b_j|^2 and the j of the minimum (the lowest in a tie).
 
     Args:
         a: (*B, N, 3) points, any unit.
@@ -104,7 +104,7 @@ def safe_sqrt(x: Tensor) -> Tensor:
 def paired_sets(
     function: str, a: Tensor, b: Tensor, a_lengths: Tensor | None, b_lengths: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, tuple[int, ...]]:
-    """Checked sets with one leading dimension, full lengths, and the leading dimensions to give back."""
+    """Checked sets with one leading dimension, lengths of all sets, and the leading dimensions for the results."""
     _checks.check_tensor(function, "a", a, ("*", "N", 3))
     batch = tuple(a.shape[:-2])
     _checks.check_tensor(function, "b", b, ("*", "M", 3))
@@ -186,7 +186,7 @@ def _both_gradient(ctx, grad_from_a: Tensor | None, _index_a, grad_from_b: Tenso
 def _nearest_both(
     a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """`_nearest` from `a` to `b` and from `b` to `a`, with one check and one sorting of each."""
+    """`_nearest` from `a` to `b` and from `b` to `a`; each set is checked and sorted once."""
     _checks.check_sets("chamfer_distance", a, b, a_lengths, b_lengths, smallest=1)
     if _is_large(a, b):
         x, y = sort_into_blocks(a, a_lengths), sort_into_blocks(b, b_lengths)
@@ -224,7 +224,7 @@ def _search(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor) -> tuple
 
 
 def _search_blocks(a: Blocks, b: Blocks, a_lengths: Tensor, b_lengths: Tensor) -> tuple[Tensor, Tensor]:
-    """As `_search`, of clouds that have been sorted."""
+    """As `_search`, of sorted clouds."""
     squared_distance = a.points.new_empty((len(a_lengths), a.size))
     index = torch.empty(squared_distance.shape, dtype=torch.int64)
     sets = a.points, a.order, b.points, b.order, b.boxes, b.box_lanes, b.groups, a_lengths, b_lengths

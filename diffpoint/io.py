@@ -12,7 +12,7 @@ from torch import Tensor
 
 from diffpoint import _checks
 
-_EMPTY = 65535  # the code of pixels that see nothing
+_EMPTY = 65535  # the code of empty pixels
 
 
 def encode_depth(depth: Tensor, *, max_depth: float = 10.0) -> np.ndarray:
@@ -90,7 +90,7 @@ def read_points(path: str | os.PathLike[str]) -> Tensor:
     """Read the vertices (N, 3) float32 of a point cloud or mesh file, in the file's frame and unit.
 
     Raises:
-        ValueError: the file holds no finite points, or is of a kind that trimesh does not know.
+        ValueError: the file holds no finite points, or is in a format that trimesh cannot read.
         OSError: it is missing.
     """
     if not Path(path).is_file():
@@ -98,7 +98,7 @@ def read_points(path: str | os.PathLike[str]) -> Tensor:
     try:
         loaded = _trimesh().load(path, process=False)
         vertices = loaded.to_geometry().vertices if hasattr(loaded, "to_geometry") else loaded.vertices
-    except Exception as error:  # every format has its own exceptions; all mean that this is no cloud
+    except Exception as error:  # every format has its own exceptions; all mean that the file is not a cloud
         raise _checks.fail("read_points", "path", "name a point cloud", f"{path}: {error}") from None
     points = torch.from_numpy(np.array(vertices, np.float32).reshape(-1, 3))
     if len(points) == 0 or not bool(torch.isfinite(points).all()):
@@ -107,8 +107,8 @@ def read_points(path: str | os.PathLike[str]) -> Tensor:
 
 
 def _replace(path: Path, write) -> None:
-    """Write beside the target and move into place, so that nobody ever reads half a file."""
-    scratch = path.with_name(f".{os.getpid()}-{path.name}")  # the ending still says the format
+    """Write a temporary file and rename it, so that a half-written file is never read."""
+    scratch = path.with_name(f".{os.getpid()}-{path.name}")  # writers choose the format by the suffix
     try:
         write(scratch)
         os.replace(scratch, path)

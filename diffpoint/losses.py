@@ -1,7 +1,7 @@
-"""The paper's losses on point clouds. The projection losses they are compared with: `projection.py`.
+"""The paper's losses on point clouds. The projection losses that it compares with are in `projection.py`.
 
 All return a tensor: with reduction="mean" a scalar, with "none" one value per item. Distances are un-squared means in
-the unit of the clouds; the paper's sums and factors of 100 are applied where its tables are made.
+the unit of the clouds; the paper's sums and factors of 100 are not applied here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Distance = Literal["chamfer", "emd"]
 
 
 class FrontSets(NamedTuple):
-    """What each view shows of the predicted cloud, and of the truth."""
+    """The visible points of the predicted cloud and the points of the true depth map, for each view."""
 
     predicted: Tensor
     """(B, V, M, 3) world frame: the predicted points that the view sees, then padding."""
@@ -178,7 +178,7 @@ def front_constraint(
     visibility: Method = "zbuffer",
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """distance(points that each view sees, points of its true depth map), in 3D.
+    """distance(predicted points that a view sees, points of its true depth map), in 3D, for each view.
 
     Args:
         points: (B, N, 3) predicted clouds in the world.
@@ -231,14 +231,14 @@ def front_constraint(
 def diversity_loss(
     codes: Tensor, clouds: Tensor, *, alpha: float, tolerance: float = 0.05, reduction: Reduction = "mean"
 ) -> Tensor:
-    """mean over pairs i < j of relu(|r_i - r_j| - alpha EMD(S_i, S_j)): different codes, different shapes.
+    """mean over pairs i < j of relu(|r_i - r_j| - alpha EMD(S_i, S_j)): different codes must give different shapes.
 
     Args:
-        codes: (R, B, D) random inputs.
-        clouds: (R, B, N, 3) the shapes they gave, world frame.
-        alpha: how much distance between shapes a distance between codes asks for, per unit of the mean earth mover's
-            distance. The paper's 0.2 and 0.1 multiply a sum over 2048 points of an approximation that is about 1.3
-            times the distance: here they are 0.2 * 2048 * 1.3 and 0.1 * 2048 * 1.3.
+        codes: (R, B, D) random inputs of a generator.
+        clouds: (R, B, N, 3) the shapes generated from them, world frame.
+        alpha: weight of the distance between shapes, the mean earth mover's distance. The paper's 0.2 and 0.1 multiply
+            a sum over 2048 points of an approximation that is about 1.3 times the distance; here they correspond to
+            0.2 * 2048 * 1.3 and 0.1 * 2048 * 1.3.
         tolerance: of the earth mover's distance.
         reduction: "mean" over all, or "none" for (B,).
 
@@ -263,14 +263,14 @@ def diversity_loss(
         _checks.check_finite("diversity_loss", "codes", codes.detach())
     first, second = _pairs("diversity_loss", "codes", codes.shape[0])
     apart = (codes[first] - codes[second]).norm(dim=-1)
-    # Shapes that have been proven to differ enough cost nothing, however much they differ.
+    # From this distance on the hinge is 0, so the exact distance is not needed.
     enough = apart / alpha if alpha > 0 else None
     moved = earth_mover_distance(clouds[first], clouds[second], tolerance=tolerance, enough=enough).cost
     return reduce_loss("diversity_loss", torch.relu(apart - alpha * moved).mean(0), reduction)
 
 
 def consistency_loss(clouds: Tensor, *, reduction: Reduction = "mean") -> Tensor:
-    """mean over pairs i < j of the chamfer distance between S_i and S_j: how far predictions disagree.
+    """mean over pairs i < j of the chamfer distance between S_i and S_j, predictions of one shape.
 
     Args:
         clouds: (*B, V, N, 3) V predictions of each shape, world frame.
@@ -297,7 +297,7 @@ def consistency_loss(clouds: Tensor, *, reduction: Reduction = "mean") -> Tensor
 
 
 def _pairs(function: str, argument: str, count: int) -> tuple[list[int], list[int]]:
-    """All i < j below `count`."""
+    """All i < j < `count`, as the list of i and the list of j."""
     if count < 2:
         raise _checks.fail(function, argument, "hold at least two to compare", str(count))
     first, second = zip(*itertools.combinations(range(count), 2), strict=True)
@@ -305,7 +305,7 @@ def _pairs(function: str, argument: str, count: int) -> tuple[list[int], list[in
 
 
 def check_maps(function: str, points: Tensor, camera: PinholeCamera, depth: Tensor) -> tuple[int, int]:
-    """(B, V) of depth maps that fit the clouds and the cameras."""
+    """Check depth maps against clouds and cameras; returns (B, V)."""
     _checks.check_clouds(function, "points", points)
     _checks.check_tensor(function, "depth", depth, (points.shape[0], "V", camera.height, camera.width))
     _checks.check_same_dtype(function, points=points, depth=depth)

@@ -1,6 +1,6 @@
-"""Losses that compare depth maps pixel by pixel: Lin's, and one whose renderer is soft.
+"""Losses that compare depth maps pixel by pixel: that of Lin et al., and one with a soft renderer.
 
-Beside the front constraint of `losses.py`: the same arguments, the same renderer, another way to use it.
+They take the same arguments as the front constraint of `losses.py`, which is compared with them.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ from diffpoint.soft_splat import soft_splat
 from diffpoint.splat import splat_depth
 
 EMPTY_LOGIT = -1.0
-"""Of a pixel that nothing falls into, as in the released code of Lin et al."""
-_INK = 2.0  # pixels that a point can cover: with as many points as pixels in the silhouette, few stay empty
-_FREE = 0.01  # coverage of every pixel: bounds the loss of an empty one, and the pull on the first point to touch it
+"""Logit of a pixel that no point falls into, as in the released code of Lin et al."""
+_POINT_COVERAGE = (
+    2.0  # of a point, in pixels: with as many points as pixels in the silhouette, few stay empty
+)
+_LEAST_COVERAGE = 0.01  # added to every pixel: bounds the loss of an empty one, and its gradient
 
 
 def projection_loss(
@@ -35,9 +37,9 @@ def projection_loss(
     upsample: int = 1,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """mean |rendered depth - true depth| over the foreground pixels that a point fell into, and a term on the mask.
+    """mean |rendered depth - true depth| over the foreground pixels that a point fell into, and a mask term.
 
-    The loss the front constraint is compared with. Pixels are assigned by a step function, so its gradient moves
+    The front constraint is compared with this loss. Pixels are assigned by a step function, so its gradient moves
     points along the camera's z axis only; empty foreground pixels and points outside the silhouette get none.
 
     Args:
@@ -47,8 +49,8 @@ def projection_loss(
         logits: (B, N) of the points' existence. Points with a logit of 0 or less are not rendered. Without logits all
             points exist, with a logit of 1.
         mask_weight: of the mask term, the mean over all pixels of the binary cross entropy between the silhouette and
-            the rendered logits: that of the contributor; where only points that do not exist fall, that of the nearest
-            of them; -1 where none falls. 0 leaves the term out.
+            the rendered logits. A pixel's logit is that of its nearest rendered point; if only points that are not
+            rendered fall into it, that of the nearest of them; -1 if none does. 0 leaves the term out.
         upsample: render maps `upsample` times as large in both directions and keep the nearest of each block: points
             that share a pixel then hide each other less ("pseudo-rendering", where it is 5).
         reduction: "mean" over all views, or "none" for (B, V).
@@ -57,7 +59,7 @@ def projection_loss(
         The loss; its depth term in world units, and 0 for a view in which no foreground pixel is hit.
 
     Gradients: of the depth term to the contributing points, along the camera's z axis, and to the camera's extrinsics;
-        of the mask term to `logits` only: it can delete points and bring them back, but not move them.
+        of the mask term to `logits` only: it removes points or adds them again, but does not move them.
 
     Raises:
         ValueError, TypeError: wrong shapes, dtypes or devices, NaN or infinite coordinates or logits, an `upsample`
@@ -85,7 +87,7 @@ def projection_loss(
         rendered, mask_logits = _render_existing(points, logits, camera, upsample=upsample)
     foreground = torch.isfinite(depth)
     both = foreground & torch.isfinite(rendered)
-    # Where not both are finite the difference is replaced before it is taken: inf - inf would poison the gradient.
+    # Replaced before the subtraction, because inf - inf would make the gradient NaN.
     difference = torch.where(both, rendered, 0.0) - torch.where(both, depth, 0.0)
     loss = difference.abs().sum((-2, -1)) / both.sum((-2, -1)).clamp(min=1)
     if mask_weight:
@@ -99,7 +101,7 @@ def projection_loss(
 def _pseudo_render(
     points: Tensor, camera: PinholeCamera, *, upsample: int, lengths: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Depth (B, V, H, W) and contributor (B, V, H, W) of a larger map, of whose blocks the nearest pixel is kept."""
+    """Depth (B, V, H, W) and contributor (B, V, H, W) of a larger map, reduced to the nearest pixel of each block."""
     if upsample == 1:
         rendered, index, _ = splat_depth(points, camera, lengths=lengths)
         return rendered, index
@@ -116,10 +118,10 @@ def _pseudo_render(
 def _render_existing(
     points: Tensor, logits: Tensor, camera: PinholeCamera, *, upsample: int
 ) -> tuple[Tensor, Tensor]:
-    """Depth of the points that exist, and the logit of every pixel, (B, V, H, W)."""
+    """Depth of the points with a positive logit, and the logit of every pixel, (B, V, H, W)."""
     exists = logits > 0
     depth, pixel_logits = None, points.new_full((), EMPTY_LOGIT)
-    for chosen in (~exists, exists):  # what exists comes last and replaces what does not
+    for chosen in (~exists, exists):  # existing points come last and overwrite the logits of the others
         order = chosen.to(torch.uint8).argsort(dim=1, descending=True, stable=True)
         sorted_points = torch.take_along_dim(points, order[..., None], 1)
         depth, index = _pseudo_render(sorted_points, camera, upsample=upsample, lengths=chosen.sum(1))
@@ -141,24 +143,24 @@ def soft_projection_loss(
     mask_weight: float = 0.1,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """The projection loss through `soft_splat`, whose depth and mask follow a point that moves sideways.
+    """The projection loss with `soft_splat`, which has gradients to x and y as well.
 
     Per view, in sums over pixels divided by the number of foreground pixels:
 
     - on the foreground, mask * |soft depth - true depth|;
-    - on the foreground, -log(mask), times `mask_weight`: empty pixels pull, crowded ones do not;
+    - on the foreground, -log(mask), times `mask_weight`: large at empty pixels, near 0 at covered ones;
     - on the background, coverage * distance to the silhouette in pixels, times `mask_weight`. The binary cross entropy
-      would be the coverage alone, which a point in the middle of the background cannot change by moving.
+      would be the coverage alone, whose gradient is 0 for a point whose whole footprint lies on the background.
 
-    The coverage of a point, spread over however large a footprint, sums up to two pixels. The map is rendered with a
-    margin of half its side, which counts as background, so that leaving the frame does not pay.
+    The coverage of a point sums up to two pixels, whatever the size of its footprint. The map is rendered with a margin
+    of half its side, which counts as background, so that moving out of the frame does not reduce the loss.
 
     Args:
         points: (B, N, 3) predicted clouds in the world.
         camera: batch shape (), (V,) or (B, V), of the depth maps' size.
         depth: (B, V, H, W) true depth maps, +inf where empty.
-        radius: of the footprints in pixels: how far an empty pixel of the foreground reaches. Start with 6 or 8, end
-            with 1.
+        radius: of the footprints in pixels: how far away a point still gets a gradient from an empty foreground pixel.
+            Start with 6 or 8 and reduce it to 1.
         softness: of the depth order, in world units.
         mask_weight: of the terms on the mask, in world units.
         reduction: "mean" over all views, or "none" for (B, V).
@@ -193,12 +195,12 @@ def soft_projection_loss(
     foreground = torch.isfinite(depth)
     count = foreground.sum((-2, -1)).clamp(min=1)
     volume = math.pi / 3 * radius**2  # of a footprint
-    coverage = _INK / volume * soft.coverage
+    coverage = _POINT_COVERAGE / volume * soft.coverage
     both = foreground & torch.isfinite(soft.depth)
     difference = torch.where(both, soft.depth, 0.0) - torch.where(both, depth, 0.0)
     loss = (-torch.expm1(-coverage) * difference.abs()).sum((-2, -1)) / count
     if mask_weight:
-        missing = -torch.log(-torch.expm1(-(coverage + _FREE)))
+        missing = -torch.log(-torch.expm1(-(coverage + _LEAST_COVERAGE)))
         wrong = torch.where(foreground, missing, distance * coverage)
         loss = loss + mask_weight * wrong.sum((-2, -1)) / count
     return reduce_loss("soft_projection_loss", loss, reduction)
@@ -216,7 +218,8 @@ def _with_margin(camera: PinholeCamera, margin: int) -> PinholeCamera:
 def _distance_to(foreground: Tensor, margin: int) -> Tensor:
     """Distance in pixels of each pixel to the nearest of the foreground; 1 where there is none.
 
-    On a map with `margin` more pixels on every side than `foreground` (B, V, H, W), plus the way to the frame.
+    On a map with `margin` more pixels on every side than `foreground` (B, V, H, W); there, the distance to the frame is
+    added.
     """
     height, width = foreground.shape[-2:]
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -228,12 +231,12 @@ def _distance_to(foreground: Tensor, margin: int) -> Tensor:
     first = flat.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :longest]
     squared = nearest(pixels.expand(len(flat), -1, -1), pixels[first], b_lengths=counts).squared_distance
     distance = torch.where(torch.isfinite(squared), squared, 1.0).sqrt().view(foreground.shape)
-    (row, down), (column, across) = (_beyond(size, margin, distance) for size in (height, width))
+    (row, down), (column, across) = (_nearest_in_frame(size, margin, distance) for size in (height, width))
     return distance[..., row, :][..., column] + torch.hypot(across, down[:, None])
 
 
-def _beyond(size: int, margin: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Of size + 2 margin pixels: the nearest one in the frame, and how far it is."""
+def _nearest_in_frame(size: int, margin: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """For each of size + 2 margin pixels: the nearest one in the frame, and its distance."""
     at = torch.arange(-margin, size + margin, device=like.device)
     framed = at.clamp(0, size - 1)
     return framed, (at - framed).abs().to(like)

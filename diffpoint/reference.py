@@ -1,8 +1,8 @@
-"""Every op once more in plain torch: slow, obvious, and the judge of the tests.
+"""Reference implementations of every op in plain torch, slow and simple; the tests compare the kernels with them.
 
 Cameras are passed as `K` (B, V, 3, 3) and `cam_from_world` (B, V, 4, 4), because this file imports torch and nothing
 else. Shapes, units, frames and conventions are those of the public functions of the same names. Gradients come from
-torch's autograd; sums over pairs are written as full matrices, so memory is O(N M).
+torch's autograd; distances are full matrices, so memory is O(N M).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import itertools
 import torch
 from torch import Tensor
 
-# Full matrices go through this, not through cdist: cdist takes another formula for large sets and loses digits.
+# Not torch.cdist, which uses a less accurate formula for large sets.
 
 
 def pairwise_squared_distance(a: Tensor, b: Tensor) -> Tensor:
@@ -44,7 +44,7 @@ def unproject_dense(depth: Tensor, K: Tensor, cam_from_world: Tensor) -> Tensor:
 
 
 def unproject(depth: Tensor, K: Tensor, cam_from_world: Tensor) -> tuple[Tensor, Tensor]:
-    """Foreground points first (B, V, H*W, 3), and how many they are (B, V)."""
+    """Foreground points first (B, V, H*W, 3), and their number (B, V)."""
     batch, views, height, width = depth.shape
     dense = unproject_dense(depth, K, cam_from_world).flatten(2, 3)
     foreground = torch.isfinite(depth).flatten(2)
@@ -60,7 +60,7 @@ def unproject(depth: Tensor, K: Tensor, cam_from_world: Tensor) -> tuple[Tensor,
 def reproject(
     depth: Tensor, source: tuple[Tensor, Tensor], target: tuple[Tensor, Tensor], size: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points, pixels, depth and validity in the target, whose map has `size` (height, width)."""
+    """Points, pixels, depth and validity in the target, whose maps have `size` (height, width)."""
     batch, views, height, width = depth.shape
     points = unproject_dense(depth, *source)
     flat = points.reshape(batch * views, height * width, 3)
@@ -88,7 +88,7 @@ def splat_depth(
     radius: float = 0.0,
     lengths: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth (B, V, H, W), index (B, V, H, W) and visible (B, V, N): every point against every pixel."""
+    """Depth (B, V, H, W), index (B, V, H, W) and visible (B, V, N); tests every point at every pixel."""
     pixels, depth = project(points, K, cam_from_world)
     u, v = pixels[..., 0, None, None], pixels[..., 1, None, None]
     rows = torch.arange(height)[:, None]
@@ -104,7 +104,7 @@ def splat_depth(
         maps = (*depth.shape[:2], height, width)
         return points.new_full(maps, torch.inf), torch.full(maps, -1), depth > 0
     nearest_depth, index = candidates.min(dim=2)
-    # torch.min may return any of equal entries; the convention is the lowest index.
+    # torch.min may return any index of a tie; the convention is the lowest.
     index = (candidates == nearest_depth[:, :, None]).to(torch.uint8).argmax(dim=2)
     empty = torch.isinf(nearest_depth)
     gathered = torch.take_along_dim(depth, index.flatten(2), dim=2).view(index.shape)
@@ -139,7 +139,7 @@ def visible_points(
     limit: float,
     lengths: Tensor | None = None,
 ) -> Tensor:
-    """(B, V, N): the method "horizon"; `filters` (F, 11) score a point's horizons, and visible is at most `limit`."""
+    """(B, V, N): the method "horizon"; `filters` (F, 11); points with a score of at most `limit` are visible."""
     batch, views = cam_from_world.shape[:2]
     visible = torch.zeros((batch, views, points.shape[1]), dtype=torch.bool)
     for b, v in itertools.product(range(batch), range(views)):
@@ -165,7 +165,7 @@ def image_positions(
 
 
 def point_spacing(image: Tensor, aspect: float) -> float:
-    """sqrt(area of the silhouette / points) in pixels, from the share of cells that the points occupy."""
+    """sqrt(area of the silhouette / points) in pixels, estimated from the share of occupied cells."""
     count = len(image)
     flat = image[:, :2] - image[:, :2].min(0).values
     flat = flat * flat.new_tensor([1.0, aspect])
@@ -178,13 +178,13 @@ def point_spacing(image: Tensor, aspect: float) -> float:
 
 
 def cell_side(flat: Tensor, cells: float, longest: float, smallest: float) -> float:
-    """Side of the squares that cut the extent of (n, 2) into about `cells`, neither way into more than `longest`."""
+    """Side of square cells of which about `cells` cover the extent of (n, 2), and at most `longest` per direction."""
     across, down = flat.max(0).values.tolist()
     return max((across * down / cells) ** 0.5, max(across, down) / longest, smallest)
 
 
 def octant(dx: Tensor, dy: Tensor) -> Tensor:
-    """0 to 7 around the circle from +x to +y; half-open, so that every direction has one."""
+    """Sector 0 to 7 of a direction, counted from +x to +y; half-open, so that every direction has one."""
     circle = torch.tensor([0, 1, 3, 2, 7, 6, 4, 5])
     return circle[4 * (dy < 0).long() + 2 * (dx < 0).long() + (dy.abs() > dx.abs()).long()]
 
@@ -192,11 +192,11 @@ def octant(dx: Tensor, dy: Tensor) -> Tensor:
 def horizons(
     image: Tensor, aspect: float, spacing: float, radius: float, *, cell: float = 2.5, deep: float = 1.5
 ) -> tuple[Tensor, Tensor]:
-    """Cosine to the view's axis of the highest neighbour in 8 sectors (m, 8), and the m points it is known of.
+    """Cosine to the view's axis of the highest neighbour in 8 sectors (m, 8), and the indices (m,) of the open points.
 
-    The cosine is negative where the highest neighbour is farther than the point, -1 where there is none. Points are
-    enclosed if on two of the four lines through their cell the cells on both sides are nearer by `deep`; these are
-    hidden, and nobody's neighbours.
+    "High" means near to the camera. The cosine is negative where the highest neighbour is farther than the point, -1 if
+    there is none. A point is enclosed if on two of the four lines through its cell the cells on both sides are nearer
+    by `deep`. Enclosed points are hidden, and are not used as neighbours; all others are open.
     """
     flat = (image[:, :2] - image[:, :2].min(0).values) * image.new_tensor([1.0, aspect])
     open_ = (~_enclosed(flat, image[:, 2], spacing, cell, deep)).nonzero()[:, 0]
@@ -226,9 +226,9 @@ def _enclosed(flat: Tensor, w: Tensor, spacing: float, cell: float, deep: float)
 
 
 def horizon_score(horizon: Tensor, filters: Tensor) -> Tensor:
-    """(m,) from horizons (m, 8) and filters (F, 11): each responds at the 8 rotations of the sectors.
+    """(m,) from horizons (m, 8) and filters (F, 11): each is applied at the 8 rotations of the sectors.
 
-    A filter is 8 weights, a bias, and what the mean and the maximum of its responses count.
+    A filter is 8 weights, a bias, and the weights of the mean and the maximum of its responses.
     """
     turned = torch.stack([horizon.roll(-k, 1) for k in range(8)])
     response = torch.relu(turned @ filters[:, :8].T + filters[:, 8])
@@ -294,7 +294,7 @@ def earth_mover_distance(
 
 
 def assign(cost: Tensor) -> Tensor:
-    """The column of each row in the cheapest assignment of all rows (n <= m), cost (n, m); O(n^2 m)."""
+    """The column of each row in the optimal assignment, cost (n, m) with n <= m; O(n^2 m)."""
     n, m = cost.shape
     row_price = cost.new_zeros(n + 1)
     column_price = cost.new_zeros(m + 1)
@@ -329,7 +329,7 @@ def assign(cost: Tensor) -> Tensor:
 def approxmatch(
     a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
 ) -> Tensor:
-    """Sum (*B) of the soft match's masses times distances; the match is held fixed for the gradient."""
+    """Sum (*B) of matched masses times distances; the match is held fixed for the gradient."""
     batch = a.shape[:-2]
     a3, b3 = a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:])
     la = torch.full((len(a3),), a.shape[-2]) if a_lengths is None else a_lengths.reshape(-1)
@@ -343,7 +343,7 @@ def approxmatch(
 
 
 def soft_match(squared_distance: Tensor) -> Tensor:
-    """(n, m) masses that the released code's matching moves between the points."""
+    """(n, m) masses that the released code moves between the points."""
     n, m = squared_distance.shape
     supply = squared_distance.new_full((n, 1), max(m // n, 1))
     demand = squared_distance.new_full((1, m), max(n // m, 1))
@@ -378,7 +378,7 @@ def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Te
 def front_constraint(
     points: Tensor, K: Tensor, cam_from_world: Tensor, depth: Tensor, *, distance: str = "chamfer"
 ) -> Tensor:
-    """(B, V): one view after the other; see the public function for views without points."""
+    """(B, V), view by view; see the public function for views without points."""
     height, width = depth.shape[-2:]
     _, _, visible = splat_depth(points, K, cam_from_world, height, width)
     truth, lengths = unproject(depth, K, cam_from_world)

@@ -1,4 +1,4 @@
-"""The projection losses and the soft splat once more in plain torch; see `reference.py`."""
+"""Reference implementations of the projection losses and the soft splat in plain torch; see `reference.py`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def soft_splat(
     softness: float,
     lengths: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Depth and coverage (B, V, H, W): every point against every pixel."""
+    """Depth and coverage (B, V, H, W); evaluates every point at every pixel."""
     pixels, z = project(points, K, cam_from_world)
     rows = torch.arange(size[0])[:, None] + 0.5
     columns = torch.arange(size[1])[None, :] + 0.5
@@ -54,7 +54,7 @@ def projection_loss(
     mask_weight: float = 0.0,
     upsample: int = 1,
 ) -> Tensor:
-    """(B, V): one view after the other, and one pixel after the other."""
+    """(B, V), view by view and pixel by pixel."""
     height, width = depth.shape[-2:]
     size = height * upsample, width * upsample
     larger = K * K.new_tensor([upsample, upsample, 1.0])[:, None]
@@ -104,7 +104,7 @@ def soft_projection_loss(
     softness: float,
     mask_weight: float,
 ) -> Tensor:
-    """(B, V): the map with its margin, one view and one background pixel after the other."""
+    """(B, V), on maps with the margin, view by view and background pixel by background pixel."""
     height, width = depth.shape[-2:]
     margin = max(height, width) // 2
     size = height + 2 * margin, width + 2 * margin

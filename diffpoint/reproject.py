@@ -1,4 +1,4 @@
-"""Between points, pixels and depth maps: project, unproject, reproject."""
+"""Conversions between points, pixels and depth maps: project, unproject, reproject."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ _TILE = 8  # as in kernels/reproject.py
 
 
 class Reprojection(NamedTuple):
-    """Where the pixels of one camera's depth map are seen by another camera."""
+    """The pixels of one camera's depth map as seen by another camera."""
 
     points: Tensor
     """(B, V, H, W, 3) world frame; zeros where the source is empty."""
     pixels: Tensor
-    """(B, V, H, W, 2) continuous image coordinates in the target; +inf where there are none."""
+    """(B, V, H, W, 2) continuous image coordinates in the target; +inf where the source is empty, or the point
+    is at or behind the camera's plane."""
     depth: Tensor
     """(B, V, H, W) z in the target's camera frame; +inf where the source is empty."""
     valid: Tensor
-    """(B, V, H, W) bool: the source pixel is foreground, and lies before the target inside its image."""
+    """(B, V, H, W) bool: the source pixel is foreground, in front of the target camera and inside its image."""
 
 
 def project(points: Tensor, camera: PinholeCamera) -> Projection:
@@ -82,7 +83,7 @@ def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Re
     Args:
         depth: (B, V, H, W) z in the source's camera frame, +inf where empty.
         source: cameras of the maps, batch shape (), (V,) or (B, V), of the maps' size.
-        target: cameras to look from, view v of it beside view v of `source`.
+        target: cameras to reproject into; view v of `source` goes to view v of `target`.
 
     Gradients: of points, pixels and depth to `depth` and both cameras.
 
@@ -174,7 +175,7 @@ def _project_backward(
 
 
 def _walk(gradient: Tensor) -> tuple[Tensor, int]:
-    """A flat tensor and the step through it: 0 for one number expanded, as behind a sum, of which a tile is made."""
+    """A flat tensor and its step: 1, or 0 for an expanded number (the gradient of a sum), of which one tile is made."""
     if any(gradient.stride()):
         return gradient.reshape(-1), 1
     return gradient.as_strided((3 * _TILE,), (0,)).contiguous(), 0

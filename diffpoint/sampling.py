@@ -10,16 +10,16 @@ from diffpoint import _bridge, _checks
 from diffpoint.blocks import sort_into_blocks
 
 _LANES = 16  # as in kernels/sampling.py
-_LARGE = 4096  # points from which passing over boxes is faster than updating every distance
+_LARGE = 4096  # points from which the search with boxes is faster than updating every distance
 
 
 def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Tensor | None = None) -> Tensor:
-    """Indices of k points, each the farthest from those before it.
+    """Indices of k points; each is the farthest from those chosen before it.
 
     Args:
         points: (*B, N, 3), any unit.
-        k: how many, at most the size of the smallest cloud.
-        start: index of the first.
+        k: how many points to choose, at most the size of the smallest cloud.
+        start: index of the first chosen point.
         lengths: (*B) int64, how many of the N points count; default all.
 
     Returns:
@@ -86,12 +86,12 @@ def _farthest(points: Tensor, lengths: Tensor, k: int, start: int) -> Tensor:
 
 
 def _unset_distance(points: Tensor, lengths: Tensor, size: int) -> Tensor:
-    """(B, size): farther than any point, and -1 in the padding, so that it is never chosen."""
+    """(B, size): +inf for points, and -1 in the padding, which is therefore never chosen."""
     return torch.where(torch.arange(size) < lengths[:, None], torch.inf, -1.0).to(points.dtype)
 
 
 def lanes(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """x, y and z of clouds (B, N, 3), each as (B, ceil(N / 16), 16) for kernels that load whole vectors."""
+    """x, y and z of clouds (B, N, 3), each as (B, ceil(N / 16), 16), for kernels that load vectors of 16."""
     batch, size, _ = points.shape
     tiles = -(-size // _LANES)
     by_axis = pad(points.detach().movedim(-1, 0), (0, tiles * _LANES - size)).contiguous()

@@ -1,4 +1,4 @@
-"""Soft splatting: depth maps and silhouettes that change smoothly when a point moves sideways."""
+"""Soft splatting: depth maps and silhouettes that change smoothly with x and y of a point."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ def soft_splat(
     """Render clouds with soft footprints and soft depth order, so that gradients reach x and y.
 
     A point at pixel position (u, v) covers the pixels whose centres lie within `radius` of it, with the footprint
-    k = (1 - r^2 / radius^2)^2 at distance r: 1 under the point, 0 at the edge, without a kink there. A pixel's depth
-    is the mean of the depths z on it with weights k exp(-z / softness), its coverage the sum of the k.
+    k = (1 - r^2 / radius^2)^2 at distance r: 1 at the point, 0 at the edge, with a continuous derivative. A pixel's
+    depth is the mean of the depths z on it with weights k exp(-z / softness), its coverage the sum of the k.
 
     Args:
         points: (B, N, 3) in the world.
         camera: batch shape (), (V,) or (B, V), for maps of camera.height x camera.width.
-        radius: of a footprint, in pixels. Gradients to x and y reach no further than this: start large, end small. From
-            0.75 on every point covers a pixel.
-        softness: of the depth order, in world units. A point that far behind another counts exp(-1) of it; towards 0
-            the nearest point of a pixel decides, as in `splat_depth`.
+        radius: of a footprint, in pixels. A pixel has gradients to x and y of points within this distance: start large
+            and reduce it. From 0.75 on every point covers at least one pixel.
+        softness: of the depth order, in world units. A point this far behind another has exp(-1) of its weight; near 0
+            only the nearest point of a pixel counts, as in `splat_depth`.
         lengths: (B,) int64, how many of the N points count; default all.
 
     Returns:
-        `SoftSplat`. Weigh the depth with the mask: where the mask goes to 0 the depth stays that of the last point.
+        `SoftSplat`. Weight the depth by the mask: where the mask goes to 0, the depth does not.
 
     Gradients: of both maps to x, y and z of the points within `radius` of a pixel, and to the camera's matrices.
 
@@ -62,14 +62,14 @@ def soft_splat(
     Source: weights exp(-z / softness) as in the soft rasterizer (Liu et al., ICCV 2019) and in Pulsar (Lassner and
         Zollhoefer, CVPR 2021), which has a footprint that fades to its edge too; smooth point footprints for learning
         clouds from silhouettes as in CAPNet (Navaneet et al., AAAI 2019) and in Insafutdinov and Dosovitskiy (NeurIPS
-        2018), who like us shrink them in the course of the optimisation.
+        2018), who also shrink them during the optimisation.
 
     Example:
         >>> camera = PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
         >>> cloud = torch.tensor([[[0.1, -0.1, 0.0]]], requires_grad=True)
         >>> soft = soft_splat(cloud, camera)
         >>> (gradient,) = torch.autograd.grad(soft.mask[0, 0, 1, 0], cloud)
-        >>> bool(gradient[0, 0, 0] != 0)  # a step to the side covers the pixel more, or less
+        >>> bool(gradient[0, 0, 0] != 0)  # moving the point sideways changes how much of the pixel is covered
         True
     """
     _checks.check_clouds("soft_splat", "points", points)
@@ -80,7 +80,7 @@ def soft_splat(
         "soft_splat", "lengths", lengths, points.shape[:1], points.shape[1], points
     )
     whole = _bridge.full_lengths(lengths, points.shape[0], points.shape[1], points)
-    if lengths is not None:  # whatever the padding holds
+    if lengths is not None:  # the padding may hold NaN
         counts = torch.arange(points.shape[1], device=points.device) < lengths[:, None]
         points = torch.where(counts[..., None], points, 0.0)
     if not torch.compiler.is_compiling():
@@ -129,7 +129,7 @@ def _soft_splat(
     radius: float,
     softness: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Depth and coverage; then what the backward pass needs: the nearest depth, and the sum of the weights."""
+    """Depth and coverage; then for the backward pass the nearest depth and the sum of the weights."""
     batch, views, count = point_depth.shape
     _checks.check_lengths_range("soft_splat", "lengths", lengths, count)
     maps = [point_depth.new_empty(batch * views * height * width) for _ in range(4)]

@@ -1,4 +1,4 @@
-"""The approximate transport of the paper's released code, for its numbers and its unit."""
+"""The approximate earth mover's distance of the paper's released code, to compare with its numbers."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from diffpoint.sampling import lanes
 def approxmatch(
     a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
 ) -> Tensor:
-    """sum_ij match_ij |a_i - b_j|: the released code's soft matching, a SUM over matched mass.
+    """sum_ij match_ij |a_i - b_j|: the soft matching of the released code, a SUM over matched mass.
 
     Masses are matched over ten growing length scales. The result is 13 to 36 % above the earth mover's distance
-    times the number of points; use `earth_mover_distance` unless you need the paper's unit.
+    times the number of points; use `earth_mover_distance` unless you need the paper's numbers.
 
     Args:
         a: (*B, N, 3) points, any unit (the length scales are absolute: meant for shapes about 1 across).
@@ -67,7 +67,7 @@ def _gradient(ctx, grad_cost: Tensor | None, *_grads):
 def _approxmatch(
     a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, with_gradient: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The cost, and its gradients to `a` and `b` for a unit gradient (zeros unless asked for)."""
+    """The cost, and its gradients to `a` and `b` for a unit gradient (zeros unless `with_gradient`)."""
     _checks.check_sets("approxmatch", a, b, a_lengths, b_lengths, smallest=1)
     count, n, m = a.shape[0], a.shape[1], b.shape[1]
     cost = torch.zeros(count, dtype=torch.float64)
@@ -109,7 +109,7 @@ def _approxmatch(
 
 
 def _without_padding(points: Tensor, lengths: Tensor) -> Tensor:
-    """Zeros in the padding: it has no mass, but no mass times NaN would be NaN."""
+    """Zeros in the padding: its mass is 0, but 0 times NaN would be NaN."""
     padding = torch.arange(points.shape[1]) >= lengths[:, None]
     return points.masked_fill(padding[..., None], 0)
 

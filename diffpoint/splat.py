@@ -1,4 +1,4 @@
-"""Point splatting: clouds to depth maps, with the index of each pixel's contributor."""
+"""Point splatting: clouds to depth maps, with the index of the point at each pixel."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from diffpoint import _bridge, _checks
 from diffpoint._runtime import runtime_info
 from diffpoint.camera import PinholeCamera, check_views
 
-_ALONE = 12_000  # points and quarters of pixels up to which waking a second thread costs more than it saves
-_PART = 16_384  # the least points of a view for which a map of their own pays
+_ALONE = 12_000  # points plus a quarter of the pixels, up to which a second thread costs more than it saves
+_PART = 16_384  # least number of points per map when the points of a view are divided among several
 
 
 class Splat(NamedTuple):
-    """Depth maps of clouds, and who contributed to them."""
+    """Depth maps of clouds, and the points that contributed to them."""
 
     depth: Tensor
     """(B, V, H, W) z in the camera frame of the nearest point; +inf where no point fell."""
     index: Tensor
-    """(B, V, H, W) int64: that point; -1 where no point fell."""
+    """(B, V, H, W) int64: index of that point; -1 where no point fell."""
     visible: Tensor
-    """(B, V, N) bool: the points that own at least one pixel."""
+    """(B, V, N) bool: the points that are the nearest of at least one pixel."""
 
 
 def splat_depth(
     points: Tensor, camera: PinholeCamera, *, radius: float = 0.0, lengths: Tensor | None = None
 ) -> Splat:
-    """Render clouds to z-buffers: a point falls in pixel floor(u), floor(v); the nearest depth wins.
+    """Render clouds to z-buffers: a point falls into pixel (floor(u), floor(v)), which keeps the nearest depth.
 
     Args:
         points: (B, N, 3) in the world.
         camera: batch shape (), (V,) or (B, V), for maps of camera.height x camera.width.
-        radius: in pixels. 0 gives each point its one pixel, as in the paper; otherwise it also covers the pixels
-            whose centres lie within `radius` of it.
+        radius: in pixels. With 0 a point covers one pixel, as in the paper; otherwise also the pixels whose centres lie
+            within `radius` of it.
         lengths: (B,) int64, how many of the N points count; default all.
 
     Returns:
-        `Splat`. Equal depths go to the lowest index, so the same input gives the same bits.
+        `Splat`. Of points with equal depth the one with the lowest index is kept: the same input gives the same bits.
 
     Gradients: of `depth` to the contributing points (along the camera's z axis only: pixels are assigned by a step
     function) and to `camera.cam_from_world`. None through `index` and `visible`.
@@ -126,7 +126,7 @@ def _splat(
 
 
 def _parts(rows: int, count: int) -> int:
-    """Among how many maps the points of a view are shared out, so that a few large clouds keep every thread busy."""
+    """Number of maps that the points of a view are divided among, so that a few large clouds use every thread."""
     if rows > 8 or count < 2 * _PART:
         return 1
     return max(1, min(runtime_info().threads // rows, count // _PART))

@@ -1,7 +1,7 @@
-"""For tests of differentiable point rendering, the reader's own included: inputs without ties, and fair comparisons.
+"""Helpers for tests of differentiable point rendering, also your own: inputs without ties, and comparisons.
 
 Rendering assigns points to pixels by a step function. A gradient check, or a comparison of two renderers that round
-differently, is only meaningful where no point sits on a step: `tie_free_clouds` makes such inputs, and
+differently, is only meaningful where no point lies on a step: `tie_free_clouds` makes such inputs, and
 `boundary_points` finds the points for which two correct renderers may disagree.
 """
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffpoint.camera import PinholeCamera, check_views
 
-# One tolerance per dtype, relative to the size of the values: sums of a few thousand terms stay below it.
+# Per dtype, relative to the size of the values; large enough for sums of a few thousand terms.
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-11}
 
 
@@ -27,9 +27,9 @@ def tie_free_clouds(
     dtype: torch.dtype = torch.float64,
     margin: float = 1e-3,
 ) -> Tensor:
-    """Clouds (batch, count, 3) in [-0.5, 0.5]^3 whose points lie off every pixel border of every view of `camera`.
+    """Clouds (batch, count, 3) in [-0.5, 0.5]^3 with no point on a pixel's border in any view of `camera`.
 
-    Depths within a cloud differ by at least `margin` / 100 in every view, so that no z-buffer is a matter of rounding.
+    Depths within a cloud differ by at least `margin` / 100 in every view, so that rounding does not change a z-buffer.
 
     Raises:
         ValueError: `count` points with these margins were not found.
@@ -57,7 +57,7 @@ def tie_free_clouds(
         if len(points) < count:
             raise ValueError(
                 f"tie_free_clouds: only {len(points)} of {count} points found with margin {margin}; "
-                "ask for fewer, or a smaller margin."
+                "choose fewer points or a smaller margin."
             )
         clouds.append(points[:count])
     return torch.stack(clouds).to(dtype)
@@ -80,9 +80,9 @@ def boundary_points(points: Tensor, camera: PinholeCamera, *, margin: float = 1e
 
 
 def check_gradients(function: Callable, *inputs: Tensor) -> None:
-    """Compare a function's gradients with finite differences in float64, and its first order with itself twice.
+    """Compare a function's gradients with finite differences in float64 (`torch.autograd.gradcheck`).
 
-    Besides `torch.autograd.gradcheck` this passes an expanded (stride 0) output gradient, as `.sum().backward()` does.
+    It also compares an expanded output gradient (stride 0, as in `.sum().backward()`) with a contiguous one.
 
     Raises:
         AssertionError: from the comparison.

@@ -1,4 +1,4 @@
-"""Earth mover's distance by auction, with a certificate of its exactness."""
+"""Earth mover's distance by auction, with a bound on its distance from the optimum."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from diffpoint import _bridge, _checks
 from diffpoint.distances import paired_sets
 from diffpoint.sampling import lanes
 
-# Bids a pair may take, per point of its larger set, before the rest is matched as it comes.
+# Limit on the bids of a pair, per point of its larger set; after it the remaining points are matched in order.
 _BIDS_PER_PERSON = 4000
-# The finest bid increment, relative to the extent of the pair: what the prices' number format still resolves.
+# The smallest bid increment, relative to the extent of the pair: the resolution of the prices' dtype.
 _RESOLUTION = {torch.float32: 2e-6, torch.float64: 1e-12}
 
-# Beyond this extent squares and prices would leave float32, and prices reach that of the padding in the kernel.
+# Beyond this extent squares and prices overflow in float32, and prices exceed that of the padding in the kernel.
 _LARGEST_EXTENT = 1e18
 
 
 class Transport(NamedTuple):
-    """An assignment between two sets, its cost, and how far from the best it can be."""
+    """An assignment between two sets, its cost, and a bound on its distance from the optimum."""
 
     cost: Tensor
     """(*B) mean distance |a_i - b_j| over the matched pairs, in the clouds' unit."""
     assignment: Tensor
     """(*B, N) int64: the point of `b` matched to each point of `a`; -1 where `a` is the larger set, or padding."""
     bound: Tensor
-    """(*B) `cost` exceeds the least possible cost by at most this."""
+    """(*B) `cost` is at most this much above the optimum."""
     converged: Tensor
-    """(*B) bool: the tolerance was reached, or the resolution of the number format, or `enough` was proven."""
+    """(*B) bool: the tolerance or the resolution of the dtype was reached, or the optimum is at least `enough`."""
     prices: Tensor
-    """(*B, max(N, M)) of the points of the larger set, at least 0: a `start` for a pair like this one."""
+    """(*B, max(N, M)) dual variables of the points of the larger set, at least 0; used by `start`."""
 
 
 def earth_mover_distance(
@@ -48,24 +48,24 @@ def earth_mover_distance(
 ) -> Transport:
     """min over injections phi of mean_i |a_i - b_phi(i)|, i over the smaller set.
 
-    Every point of the smaller set gets its own point of the larger one. An auction with a falling bid increment
-    stops when its duality gap proves the cost to be within `tolerance` of the least (it is usually much closer).
+    Every point of the smaller set is matched to its own point of the larger one. An auction with a decreasing bid
+    increment stops when the duality gap is at most `tolerance` (the cost is usually much closer to the optimum).
 
     Args:
         a: (*B, N, 3) points, any unit.
         b: (*B, M, 3) points, same unit, dtype and leading dimensions.
-        tolerance: how far above the least cost the result may be, relative to it.
-        start: the result for sets of these sizes in the same order that have moved a little since, as from one step
-            of a descent to the next: its prices make the auction two to five times faster. What is promised holds
-            whatever they are.
-        enough: (*B) where the least cost is proven to be at least this, the auction ends, and `cost` is only known to
-            be no less: for a hinge, which is 0 from there on. The proof is cheap where the clouds are far apart.
+        tolerance: how far above the optimum the cost may be, relative to it.
+        start: the result for the same sets before a small motion, as in the previous step of a descent: sizes and order
+            of the points must be the same. Its prices make the auction two to five times faster. Tolerance and bound
+            hold for any prices.
+        enough: (*B) the auction stops once a lower bound of the optimum reaches this; the cost is then an upper bound
+            on the optimum. For a hinge loss that is 0 from there on. It saves most where the clouds are far apart.
         a_lengths: (*B) int64, how many of the N points count; default all.
         b_lengths: (*B) int64, how many of the M points count; default all.
 
     Returns:
-        `Transport`; its `bound` holds whether or not it converged. The mean is of un-squared distances: papers'
-        sums are `cost` times the size of the smaller set.
+        `Transport`; its `bound` holds even if `converged` is False. The mean is of un-squared distances; the sum in
+        papers is `cost` times the size of the smaller set.
 
     Gradients: of `cost` to `a` and `b` with the assignment held fixed (unit vectors between matched points over
     their number); 0 for matched points that coincide.
@@ -107,7 +107,7 @@ def earth_mover_distance(
 
 
 def _start(name: str, start: Transport | None, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Prices (B, size) and mean costs (B,) to start from; zeros and -1 where nothing is known."""
+    """Prices (B, size) and mean costs (B,) to start from; zeros and -1 without `start`."""
     batch, size = tuple(a.shape[:-2]), max(a.shape[-2], b.shape[-2])
     count = torch.Size(batch).numel()
     if start is None:
@@ -182,7 +182,7 @@ def _transport(
             torch.empty_like(prices),
         )
 
-    # The smaller set of each pair are the auction's persons, the larger one its objects.
+    # In the auction the points of the smaller set are the bidders ("persons"), those of the larger set the objects.
     size = max(n, m)
     swap = a_lengths > b_lengths
     a_wide = pad(a.detach(), (0, 0, 0, size - n))
@@ -201,7 +201,7 @@ def _transport(
             "Scale both down.",
         )
     axes = lanes(objects)
-    # Only differences between prices count; taking off the least keeps them from growing, start after start.
+    # Only differences between prices matter; without this they would grow from start to start.
     prices = prices - prices.amin(1, keepdim=True)
     price_lanes = pad(prices, (0, axes[0][0].numel() - size)).view(axes[0].shape)
     object_of, person_of, queue = (torch.full((count, size), -1, dtype=torch.int32) for _ in range(3))
@@ -228,7 +228,7 @@ def _transport(
         _RESOLUTION[a.dtype],
         _BIDS_PER_PERSON,
     )
-    # Indexed by the points of `a`; partners beyond the number of persons are dummies.
+    # Indexed by the points of `a`; partners beyond the number of persons are dummy persons.
     partner = torch.where(swap[:, None], person_of, object_of)[:, :n].to(torch.int64)
     real = (torch.arange(n) < a_lengths[:, None]) & (partner >= 0) & (partner < b_lengths[:, None])
     assignment = torch.where(real, partner, -1)
@@ -242,7 +242,7 @@ def _transport(
 
 
 def _extent(persons: Tensor, person_counts: Tensor, objects: Tensor, object_counts: Tensor) -> Tensor:
-    """Diagonal of the bounding box of each pair; at least the smallest number that prices can carry."""
+    """Diagonal of the bounding box of each pair; at least 1e-20, because bid increments are relative to it."""
     low, high = [], []
     for cloud, counts in ((persons, person_counts), (objects, object_counts)):
         padding = (torch.arange(cloud.shape[1]) >= counts[:, None])[..., None]

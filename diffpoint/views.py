@@ -1,4 +1,4 @@
-"""View based sampling: the points of a cloud that contribute to a view, with their gradient."""
+"""View based sampling: the points of a cloud that a view sees, with gradients."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class ViewSample(NamedTuple):
 
 
 def sample_view(points: Tensor, splat: Splat | Tensor) -> ViewSample:
-    """Gather the points that each view sees: with `splat_depth`, those that own a pixel of it.
+    """Gather the points that each view sees.
 
     Args:
-        points: (B, N, 3) in the world, those that `splat` was rendered from.
-        splat: the result of `splat_depth`, or that of `visible_points`: (B, V, N) bool.
+        points: (B, N, 3) in the world, the cloud that `splat` was rendered from.
+        splat: the result of `splat_depth`, whose `visible` points are gathered, or of `visible_points`, (B, V, N) bool.
 
     Returns:
-        `ViewSample`; a view that no point falls into has length 0.
+        `ViewSample`; a view that sees no point has length 0.
 
-    Gradients: of `points` to x, y and z of the chosen points; none through the choice.
+    Gradients: of `points` to x, y and z of the chosen points; none through the choice of the points.
 
     Raises:
         ValueError, TypeError: `points` and `splat` of different sizes, wrong dtype or device, NaN or infinite
@@ -112,7 +112,7 @@ def _sample_view(points: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tenso
             index.view(flat, largest),
             views,
         )
-        if not math.isfinite(float(sampled.sum())):  # one pass over the sample, not over the cloud
+        if not math.isfinite(float(sampled.sum())):  # reads the sample, which is smaller than the cloud
             unseen = ~visible.any(1)
             _checks.check_finite("sample_view", "points", points.masked_fill(unseen[..., None], 0))
     return sampled, index, lengths

@@ -1,4 +1,4 @@
-"""Which points of a cloud a camera sees: the paper's z-buffer, and tests that see more and err less."""
+"""Which points of a cloud a camera sees: the paper's z-buffer, and more accurate methods."""
 
 from __future__ import annotations
 
@@ -117,10 +117,12 @@ def _visible(
     if method == "hpr":
         return _on_flipped_hull(points, lengths, projection, height, width, radius)
     visible = torch.empty(shape, dtype=torch.uint8)
-    # Views take turns in the working memory of a few workers: fresh memory for each would cost as much as the work.
+    # Views share the memory of a few workers: allocating memory for each view would take as long as the kernel.
     workers = min(shape[0] * shape[1], 4 * runtime_info().threads)
     cells = torch.empty(workers * (8 * count + 32), dtype=torch.int32)
-    row = count + 17  # a register's worth of padding, and one place for the points that are left out
+    row = (
+        count + 17
+    )  # padding of one vector register, and one place that collects the points that are left out
     _bridge.launch(
         "visibility",
         "horizon",
@@ -148,7 +150,7 @@ def _visible(
 
 
 def _limit(probability: float) -> float:
-    """The score of the filters at which a point is hidden with this probability."""
+    """The score of the filters at which a point is hidden with the given probability."""
     p = min(max(probability, 1e-6), 1 - 1e-6)
     return math.log(p / (1 - p)) - BIAS
 

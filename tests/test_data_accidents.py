@@ -1,33 +1,39 @@
-"""What befalls a long conversion: a kill, a full disk, an enormous mesh. Each in a process of its own."""
+"""Long conversions: a kill, Ctrl-C, a full disk, an enormous mesh."""
 
+import contextlib
 import os
 import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 import trimesh
 
+from train.__main__ import main
 from train.data import ShapeTree, tree_files
 from train.data.meshes import convert
 
-BOXES = 16
-SETTINGS = {"size": 112, "views": 6}
+BOXES = 12
+SETTINGS = {"size": 64, "views": 4}
 
 
-def command(source, out, processes):
+def arguments(source, out, processes):
     words = ["data", "meshes", source, "--out", out, "--processes", processes]
     words += [word for name, value in SETTINGS.items() for word in (f"--{name}", value)]
-    return [sys.executable, "-m", "train", *map(str, words)]
+    return [str(word) for word in words]
 
 
-def save_boxes(folder, count=BOXES):
+@pytest.fixture
+def boxes(tmp_path):
+    folder = tmp_path / "in"
     folder.mkdir()
-    for number in range(count):
+    for number in range(BOXES):
         trimesh.creation.box((1, 1 + number / 10, 2)).export(folder / f"box {number:02d}.ply")
+    return folder
 
 
 def files_of(root):
@@ -36,92 +42,66 @@ def files_of(root):
     }
 
 
-def ends(group, seconds=60):
-    """True if all processes of the group end by themselves."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        try:
-            os.killpg(group, 0)
-        except ProcessLookupError:
-            return True
-        time.sleep(0.05)
-    return False
+def finished(out):
+    return len(list(out.glob(f"{tree_files.RENDERS}/*/box*")))
 
 
-def test_a_killed_run_leaves_no_process_and_is_finished_by_the_next(tmp_path):
-    save_boxes(tmp_path / "in")
+def test_a_killed_run_is_finished_by_the_next(boxes, tmp_path):
     out = tmp_path / "out"
-    run = subprocess.Popen(
-        command(tmp_path / "in", out, 2), start_new_session=True, stderr=subprocess.DEVNULL
-    )
-    deadline = time.monotonic() + 120
-    while not list(out.glob(f"{tree_files.RENDERS}/*/box*")) and time.monotonic() < deadline:
-        time.sleep(0.005)
-    os.kill(run.pid, signal.SIGKILL)
-    run.wait()
-    started = len(list(out.glob(f"{tree_files.RENDERS}/*/box*")))
+    command = [sys.executable, "-m", "train", *arguments(boxes, out, 1)]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as run:
+        while not finished(out):
+            assert run.poll() is None
+            time.sleep(0.002)
+        run.kill()
+    started = finished(out)
     assert 1 <= started < BOXES  # it was killed in the middle
     assert not (out / tree_files.LISTS).exists()
-    assert ends(run.pid)  # its workers went with it
 
-    report = convert([tmp_path / "in"], out, processes=1, **SETTINGS)
+    report = convert(boxes, out, processes=1, **SETTINGS)
     assert report.made + report.kept == BOXES
     assert report.kept >= started
-    convert([tmp_path / "in"], tmp_path / "whole", processes=1, **SETTINGS)
+    convert(boxes, tmp_path / "whole", processes=1, **SETTINGS)
     assert files_of(out) == files_of(tmp_path / "whole")
 
 
-@pytest.fixture
-def heeds_interrupts():
-    """A suite that a shell started in the background ignores SIGINT, and so would the processes that it starts."""
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, handler)
+def test_an_interrupted_command_ends_with_one_word(boxes, tmp_path, capsys):
+    def interrupt():
+        while not finished(tmp_path / "out"):
+            time.sleep(0.002)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by a suite in the background
+    try:
+        threading.Thread(target=interrupt, daemon=True).start()
+        assert main(arguments(boxes, tmp_path / "out", 1)) == 130
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted"
 
 
-@pytest.mark.usefixtures("heeds_interrupts")
-def test_an_interrupted_run_ends_at_once_with_one_word(tmp_path):
-    """Also its workers, which a terminal interrupts as well, while they are still starting."""
-    save_boxes(tmp_path / "in", 300)  # enough to be at work still on a machine that has other work to do
-    run = subprocess.Popen(
-        command(tmp_path / "in", tmp_path / "out", 2),
-        start_new_session=True,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 120
-    while not (tmp_path / "out" / "made_with.json").exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    time.sleep(1)
-    os.killpg(run.pid, signal.SIGINT)
-    _, errors = run.communicate(timeout=60)
-    assert run.returncode == 130
-    assert errors.splitlines()[-1] == "interrupted"
-    assert "Traceback" not in errors
-    assert ends(run.pid)
+@contextlib.contextmanager
+def small_files():
+    """Files of more than 20 kB cannot be written, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-@pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs limits of the system")
 @pytest.mark.parametrize("processes", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_full_disk_stops_the_run_with_one_line(tmp_path, processes):
-    """A limit on the size of files stands for the disk: the first cloud of 24 kB cannot be written."""
-    save_boxes(tmp_path / "in")
+def test_a_full_disk_stops_the_run_with_one_line(boxes, tmp_path, capsys, processes):
     out = tmp_path / "out"
-    result = subprocess.run(
-        command(tmp_path / "in", out, processes),
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert result.returncode == 2
-    last = result.stderr.splitlines()[-1]
+    with small_files():  # the first cloud of 24 kB cannot be written
+        assert main(arguments(boxes, out, processes)) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("error: rendering meshes stopped: File too large")
     assert "run the same command again" in last
-    assert "Traceback" not in result.stderr
     assert not list(out.glob(f"{tree_files.RENDERS}/*/*"))  # nothing half-written, not even hidden
     if processes == 1:
-        assert convert([tmp_path / "in"], out, processes=1, **SETTINGS).made == BOXES
+        assert convert(boxes, out, processes=1, **SETTINGS).made == BOXES
 
 
 def save_ball(path, side):
@@ -139,11 +119,12 @@ def save_ball(path, side):
 
 @pytest.mark.slow
 def test_three_million_faces_take_neither_all_memory_nor_all_day(tmp_path):
-    """Within 3 GB and two minutes, beside a small mesh that is none the worse for it."""
+    """Within 3 GB and two minutes, beside a small mesh that is made all the same."""
     assert save_ball(tmp_path / "in" / "ball.ply", 1230) > 3_000_000
     trimesh.creation.box().export(tmp_path / "in" / "box.ply")
+    command = [sys.executable, "-m", "train", *arguments(tmp_path / "in", tmp_path / "out", 1)]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command(tmp_path / "in", tmp_path / "out", 1), check=True, capture_output=True)
+    subprocess.run(command, check=True, capture_output=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert after.ru_utime - before.ru_utime < 120
     assert after.ru_maxrss < 3e6  # kB

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import imageio.v3 as imageio
-import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from diffpoint.io import read_points, write_points
-from train.data import ShapeTree, tree_files
+from train.__main__ import main
+from train.data import Shape, ShapeTree, tree_files
 from train.data.batches import LoadedSplit, Sampler, load_split
 from train.data.cache import prepare
-from train.data.shape import Shape
 from train.data.shrink import Sizes, shrink
 from train.data.tree import _found_frame, read_shape
 
@@ -40,65 +37,62 @@ def tree(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 def _prepare(root: Path) -> dict[str, Shape]:
-    shapes = prepare(root, ShapeTree(root, "train").ids, SIZES, progress=False)
-    assert all(isinstance(shape, Shape) for shape in shapes.values())
-    return {name: shape for name, shape in shapes.items() if isinstance(shape, Shape)}
+    found = prepare(root, ShapeTree(root, "train").ids, SIZES, progress=False)
+    shapes = {name: shape for name, shape in found.items() if isinstance(shape, Shape)}
+    assert len(shapes) == len(found)
+    return shapes
 
 
-def _fresh(root: Path) -> dict[str, Shape]:
-    return {name: shrink(read_shape(root, name), SIZES) for name in ShapeTree(root, "train").ids}
+def _tensors(shape: Shape) -> tuple[torch.Tensor, ...]:
+    return shape.images, shape.depth, shape.camera.K, shape.camera.cam_from_world, shape.points
 
 
-def _same(some: dict[str, Shape], others: dict[str, Shape]) -> bool:
-    return list(some) == list(others) and all(
-        (a.dtype == b.dtype and torch.equal(a, b))
-        if isinstance(a, Tensor) and isinstance(b, Tensor)
-        else a == b
-        for name in some
-        for a, b in zip(some[name], others[name], strict=True)
+def _same(some: Shape, other: Shape) -> bool:
+    return all(
+        a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(_tensors(some), _tensors(other), strict=True)
     )
 
 
+def _assert_fresh(shapes: dict[str, Shape], root: Path) -> None:
+    """They are what the tree's files give when they are read anew."""
+    assert list(shapes) == ShapeTree(root, "train").ids
+    for name, shape in shapes.items():
+        fresh = shrink(read_shape(root, name), SIZES)
+        assert _same(shape, fresh)
+        assert (shape.id, shape.category) == (name, fresh.category)
+
+
 def _files(place: Path) -> dict[str, int]:
-    """Prepared files and when they were made."""
-    return {path.stem: path.stat().st_mtime_ns for path in sorted(place.rglob("*.safetensors"))}
+    """Prepared files and when they got their name."""
+    return {path.stem: path.stat().st_ctime_ns for path in sorted(place.rglob("*.safetensors"))}
 
 
-def test_prepared_shapes_are_those_of_a_fresh_reading(tree: Path) -> None:
-    first, fresh = _prepare(tree), _fresh(tree)
+def test_prepared_shapes_are_made_once_and_mapped(tree: Path) -> None:
+    first = _prepare(tree)
+    _assert_fresh(first, tree)
     made = _files(tree)
-    assert set(made) == {name.split("/")[1] for name in fresh}
-    assert _same(first, fresh)
-    assert _same(_prepare(tree), fresh)
-    assert _files(tree) == made
-
-
-def test_no_picture_is_decoded_twice(tree: Path) -> None:
-    """Pictures that cannot be decoded any more are not missed, as long as nothing says that they have changed."""
-    before = _prepare(tree)
-    for picture in (tree / tree_files.RENDERS).rglob("*.png"):
+    assert set(made) == {name.split("/")[1] for name in first}
+    for picture in (tree / tree_files.RENDERS).rglob("*.png"):  # unreadable, but it does not look changed
         status = picture.stat()
         picture.write_bytes(b"x" * status.st_size)
         os.utime(picture, ns=(status.st_atime_ns, status.st_mtime_ns))
-    assert _same(_prepare(tree), before)
-
-
-def test_tensors_are_mapped_from_the_files(tree: Path) -> None:
-    shapes = _prepare(tree)
+    again = _prepare(tree)
+    assert all(_same(again[name], first[name]) for name in first)
+    assert _files(tree) == made
     mapped = Path("/proc/self/maps")
-    if not mapped.exists():
-        pytest.skip("only Linux shows what is mapped")
-    lines = [line for line in mapped.read_text().splitlines() if str(tree) in line]
-    assert len(lines) >= len(shapes)
+    if mapped.exists():
+        assert len(
+            {line.split()[-1] for line in mapped.read_text().splitlines() if str(tree) in line}
+        ) >= len(first)
 
 
 def test_other_sizes_have_files_of_their_own(tree: Path) -> None:
     ids = ShapeTree(tree, "train").ids[:1]
     for sizes in (SIZES, Sizes((48, 64), 16, "min"), Sizes((24, 32), 16), Sizes((48, 64), 32)):
-        (shape,) = prepare(tree, ids, sizes, progress=False).values()
+        (shape,) = prepare(str(tree), ids, sizes, progress=False).values()
         assert isinstance(shape, Shape)
         assert shape.images.shape[-2:] == sizes.image_size
-        assert shape.depth.shape[-1] == sizes.map_size
+        assert shape.depth.shape[-1] == shape.camera.height == sizes.map_size
     assert len(list((tree / ".prepared").rglob("*.safetensors"))) == 4
 
 
@@ -130,19 +124,11 @@ def test_a_changed_shape_is_read_again(
     victim = list(before)[1]
     change(tree, victim)
     after = _prepare(tree)
-    assert _same(after, _fresh(tree))
-    assert not _same({victim: after[victim]}, {victim: before[victim]})
+    _assert_fresh(after, tree)
+    assert not _same(after[victim], before[victim])
     assert capsys.readouterr().err.count("1 prepared shape is outdated; made again") == 1
     again = _files(tree)
     assert [name for name in made if again[name] != made[name]] == [victim.split("/")[1]]
-
-
-def _truncate(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def _empty(path: Path) -> None:
-    path.write_bytes(b"")
 
 
 def _flip_a_bit(path: Path) -> None:
@@ -151,37 +137,50 @@ def _flip_a_bit(path: Path) -> None:
     path.write_bytes(content)
 
 
-def _zero_the_end(path: Path) -> None:
-    content = path.read_bytes()
-    path.write_bytes(content[:-4096] + bytes(4096))
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "empty": lambda path: path.write_bytes(b""),
+    "one bit": _flip_a_bit,
+    "zeros at the end": lambda path: path.write_bytes(path.read_bytes()[:-4096] + bytes(4096)),
+    "text": lambda path: path.write_text("these are not the bytes you are looking for"),
+}
 
 
-def _replace_by_text(path: Path) -> None:
-    path.write_text("these are not the bytes you are looking for")
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_is_made_again(tree: Path, damage: str, capsys: pytest.CaptureFixture[str]) -> None:
+    _prepare(tree)
+    DAMAGES[damage](min((tree / ".prepared").rglob("*.safetensors")))
+    _assert_fresh(_prepare(tree), tree)
+    assert capsys.readouterr().err.count("1 prepared shape is damaged; made again") == 1
+    _assert_fresh(_prepare(tree), tree)
+    assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize("damage", [_truncate, _empty, _flip_a_bit, _zero_the_end, _replace_by_text])
-def test_a_damaged_file_is_made_again(
-    tree: Path, damage: Callable[[Path], None], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damage_by_the_disk_is_found_by_data_check(tree: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A start compares sizes and times only; the checksum is for the check, which reads everything."""
     _prepare(tree)
     victim = min((tree / ".prepared").rglob("*.safetensors"))
-    damage(victim)
-    assert _same(_prepare(tree), _fresh(tree))
-    assert capsys.readouterr().err.count("1 prepared shape is damaged; made again") == 1
-    assert _same(_prepare(tree), _fresh(tree))
-    assert capsys.readouterr().err == ""
+    written = victim.stat().st_mtime_ns
+    _flip_a_bit(victim)
+    os.utime(victim, ns=(written, written))
+    assert main(["data", "check", str(tree)]) == 1
+    said = capsys.readouterr().out
+    assert "1 problem:" in said
+    assert f"{victim}: prepared for training, and damaged; delete it" in said
+    victim.unlink()
+    _assert_fresh(_prepare(tree), tree)
+    assert main(["data", "check", str(tree)]) == 0
 
 
 def test_a_tree_that_cannot_be_written_to_is_prepared_elsewhere(
     tree: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tree / ".prepared").write_text("in the way, even of an administrator")
-    assert _same(_prepare(tree), _fresh(tree))
+    _assert_fresh(_prepare(tree), tree)
     assert "cannot be written to; its prepared shapes are kept in" in capsys.readouterr().err
     made = _files(tmp_path / "cache")
     assert len(made) == len(ShapeTree(tree, "train"))
-    assert _same(_prepare(tree), _fresh(tree))
+    _assert_fresh(_prepare(tree), tree)
     assert _files(tmp_path / "cache") == made
     assert capsys.readouterr().err == ""
 
@@ -198,12 +197,12 @@ def test_old_files_in_a_tree_that_cannot_be_written_to_are_passed_over(
     files.unlink()
     shutil.move(tmp_path / "aside", files)
     capsys.readouterr()
-    assert _same(_prepare(tree), _fresh(tree))
+    _assert_fresh(_prepare(tree), tree)
     assert capsys.readouterr().err == ""
 
 
 def test_a_turned_tree_is_read_again(tree: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A tree from elsewhere, whose clouds turn out to be in another frame than was thought."""
+    """A tree from elsewhere, whose clouds turn out to have another axis convention than before."""
     (tree / "made_with.json").unlink()
     before = _prepare(tree)
     for file in (tree / tree_files.CLOUDS).rglob("*.ply"):
@@ -213,7 +212,7 @@ def test_a_turned_tree_is_read_again(tree: Path, capsys: pytest.CaptureFixture[s
         os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
     _found_frame.cache_clear()
     after = _prepare(tree)
-    assert _same(after, _fresh(tree))
+    _assert_fresh(after, tree)
     assert all(torch.allclose(after[name].points, before[name].points, atol=1e-6) for name in before)
     assert f"{len(before)} prepared shapes are outdated" in capsys.readouterr().err
 
@@ -222,8 +221,8 @@ def test_without_any_place_shapes_are_read_into_memory(
     tree: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("DIFFPOINT_PREPARED", "/proc/nowhere")
-    assert _same(_prepare(tree), _fresh(tree))
-    assert "no place to keep prepared shapes" in capsys.readouterr().err
+    _assert_fresh(_prepare(tree), tree)
+    assert "no folder for prepared shapes can be written to" in capsys.readouterr().err
     assert not _files(tree)
 
 
@@ -239,76 +238,52 @@ def test_the_environment_names_a_place_for_all_trees(
     assert not (tree / ".prepared").exists()
 
 
+def test_a_killed_preparation_is_finished_by_the_next(tree: Path) -> None:
+    _prepare(tree)
+    place = next((tree / ".prepared").iterdir())
+    lost, *kept = sorted(place.rglob("*.safetensors"))
+    lost.unlink()
+    leftover = lost.with_name(".a.safetensors.0123.tmp")
+    leftover.write_bytes(b"what it was writing")
+    made = _files(tree)
+    _assert_fresh(_prepare(tree), tree)
+    finished = _files(tree)
+    assert finished.items() >= made.items()
+    assert len(finished) == len(kept) + 1
+    assert not leftover.exists()
+
+
 _PREPARE = """
 import sys
-from pathlib import Path
 from train.data import ShapeTree
 from train.data.cache import prepare
-from train.data.shape import Shape
 from train.data.shrink import Sizes
-root = Path(sys.argv[1])
-shapes = prepare(root, ShapeTree(root, "train").ids, Sizes((48, 64), 16))
-assert all(isinstance(shape, Shape) for shape in shapes.values()), shapes
+prepare(sys.argv[1], ShapeTree(sys.argv[1], "train").ids, Sizes((48, 64), 16))
 assert not any(name.split(".")[0] == "taichi" for name in sys.modules), "the kernels were started"
-print(sum(int(shape.images.sum()) for shape in shapes.values()))
 """
 
 
-def _begin_elsewhere(tree: Path) -> subprocess.Popen[str]:
-    """A process that has begun to prepare a tree, of now many shapes, and has a while to go."""
-    for synset in (tree / tree_files.LISTS / "train").glob("*.list"):
-        lines = synset.read_text().split()
-        for copy in (f"{line}_copy{k}" for line in lines[:4] for k in range(12)):
-            lines.append(copy)
-            original = copy.split("_copy")[0]
-            (tree / tree_files.RENDERS / copy).symlink_to(tree / tree_files.RENDERS / original)
-            (tree / tree_files.CLOUDS / f"{copy}.ply").symlink_to(
-                tree / tree_files.CLOUDS / f"{original}.ply"
-            )
-        synset.write_text("\n".join(lines))
-    process = subprocess.Popen(
-        [sys.executable, "-c", _PREPARE, str(tree)],
-        cwd=REPOSITORY,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    while len(_files(tree)) < 5:
-        assert process.poll() is None
-        time.sleep(0.01)
-    return process
-
-
-def test_a_killed_preparation_goes_on_where_it_was(tree: Path) -> None:
-    process = _begin_elsewhere(tree)
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    made = _files(tree)
-    leftover = next((tree / ".prepared").rglob("*.safetensors")).with_name(".a.safetensors.0123.tmp")
-    leftover.write_bytes(b"what it was writing")
-    shapes = _prepare(tree)
-    assert 5 <= len(made) < len(shapes)
-    finished = _files(tree)
-    assert len(finished) == len(shapes)
-    assert finished.items() >= made.items()
-    assert not leftover.exists()
-    fresh = _fresh(tree)
-    assert _same(shapes, fresh)
-
-
-def test_processes_that_start_together_make_each_file_once(
-    tree: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    process = _begin_elsewhere(tree)
-    shapes = _prepare(tree)
-    out, complaint = process.communicate()
-    assert process.returncode == 0, complaint
-    assert "another process prepares the shapes" in capsys.readouterr().err
-    assert int(out) == sum(int(shape.images.sum()) for shape in shapes.values())
-    finished = max(_files(tree).values())
-    assert finished <= time.time_ns()
-    assert _same(_prepare(tree), shapes)
-    assert max(_files(tree).values()) == finished
+def test_processes_that_start_together_make_each_file_once(tree: Path) -> None:
+    place = tree / ".prepared" / "48x64-maps16-decimate-v2"
+    place.mkdir(parents=True)
+    with (place / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # as the process that makes them
+        other = subprocess.Popen(
+            [sys.executable, "-c", _PREPARE, str(tree)], cwd=REPOSITORY, stderr=subprocess.PIPE, text=True
+        )
+        assert other.stderr is not None
+        waits = next(line for line in other.stderr if "opening" not in line)
+        assert f"another process prepares the shapes in {place}; waiting for it" in waits
+        shutil.copytree(tree, tree.parent / "twin", ignore=shutil.ignore_patterns(".prepared"))
+        _prepare(tree.parent / "twin")
+        for path in (tree.parent / "twin" / ".prepared" / place.name).iterdir():
+            if path.is_dir():
+                shutil.copytree(path, place / path.name)
+        made = _files(tree)
+        assert other.poll() is None
+    _, complaint = other.communicate(timeout=60)
+    assert other.returncode == 0, complaint
+    assert _files(tree) == made
 
 
 def test_a_full_disk_costs_only_the_files(tree: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -319,7 +294,7 @@ def test_a_full_disk_costs_only_the_files(tree: Path, capsys: pytest.CaptureFixt
         shapes = _prepare(tree)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert _same(shapes, _fresh(tree))
+    _assert_fresh(shapes, tree)
     assert "prepared shapes cannot be kept in" in capsys.readouterr().err
     assert not _files(tree)
 
@@ -349,17 +324,16 @@ def test_the_same_seed_gives_the_same_batches_from_fresh_and_from_prepared_shape
     continued = begun + _batches(again, resumed, 4)
     assert again.fingerprint == first.fingerprint
 
-    fresh = list(_fresh(tree).values())
+    fresh = [_tensors(shrink(read_shape(tree, name), SIZES))[:4] for name in ShapeTree(tree, "train").ids]
     sampler, expected = Sampler(len(fresh), first.views, seed=3), []
     for _ in range(6):
         shapes, views = sampler.draw(4, 2)
-        rows = [(fresh[shape], view) for shape, view in zip(shapes.tolist(), views, strict=True)]
-        expected += [
-            torch.stack([shape.images[view] for shape, view in rows]).float() / 255,
-            torch.stack([shape.depth[view] for shape, view in rows]),
-            torch.stack([shape.K[view] for shape, view in rows]),
-            torch.stack([shape.cam_from_world[view] for shape, view in rows]),
+        rows = [
+            [values[view] for values in fresh[shape]]
+            for shape, view in zip(shapes.tolist(), views, strict=True)
         ]
+        images, *others = (torch.stack(values) for values in zip(*rows, strict=True))
+        expected += [images.float() / 255, *others]
     assert all(torch.equal(a, b) for a, b in zip(whole, expected, strict=True))
     assert all(torch.equal(a, b) for a, b in zip(continued, expected, strict=True))
-    assert len({tuple(np.unique(images.numpy())[:50]) for images in whole[::4]}) > 1
+    assert len({images.sum().item() for images in whole[::4]}) > 1

@@ -1,4 +1,4 @@
-"""Cameras, depth maps and clouds agree, for both kinds of data, and the check sees when they do not."""
+"""Looking at data: `data check` sees whether cameras, depth maps and clouds agree, `data show` draws them."""
 
 import dataclasses
 import json
@@ -17,6 +17,7 @@ from train.__main__ import main
 from train.data import ShapeTree, tree_files
 from train.data.check import check_tree
 from train.data.consistency import measure_consistency
+from train.data.contact_sheet import _arranged, show, strip_of
 from train.data.meshes import convert
 from train.data.procedural import generate
 from train.errors import UserError
@@ -56,7 +57,7 @@ def test_mesh_data_agree(tmp_path):
         pose = trimesh.transformations.translation_matrix((x, -0.6, z))
         table.append(trimesh.creation.box((0.08, 1.2, 0.08), transform=pose))
     trimesh.util.concatenate(table).export(folder / "table.off")
-    convert([folder], tmp_path / "out", labels=None, size=112, views=4, processes=1)
+    convert([folder], tmp_path / "out", size=112, views=4, processes=1)
     assert_agrees(check_tree(tmp_path / "out"), 4)
 
 
@@ -73,10 +74,6 @@ def test_real_furniture_agrees(tmp_path):
     assert_agrees(check_tree(tmp_path / "out"), report.made)
 
 
-def shape_with(shape, **changes):
-    return dataclasses.replace(shape, **changes)
-
-
 def test_each_way_to_disagree_is_seen(procedural):
     tree = ShapeTree(procedural)
     # A deep body, so that no half turn maps the shape to itself.
@@ -87,15 +84,15 @@ def test_each_way_to_disagree_is_seen(procedural):
     pushed = shape.camera.cam_from_world.clone()
     pushed[:, 2, 3] += 0.02
     wrong = {
-        "mirrored cloud": shape_with(shape, points=shape.points @ flip),
-        "z-up cloud": shape_with(shape, points=shape.points @ turn.T),
-        "larger cloud": shape_with(shape, points=shape.points * 1.1),
-        "views in another order": shape_with(shape, depth=shape.depth.roll(1, 0)),
-        "depth as ray length": shape_with(shape, depth=shape.depth * 1.02),
-        "camera further off": shape_with(
+        "mirrored cloud": dataclasses.replace(shape, points=shape.points @ flip),
+        "z-up cloud": dataclasses.replace(shape, points=shape.points @ turn.T),
+        "larger cloud": dataclasses.replace(shape, points=shape.points * 1.1),
+        "views in another order": dataclasses.replace(shape, depth=shape.depth.roll(1, 0)),
+        "depth as ray length": dataclasses.replace(shape, depth=shape.depth * 1.02),
+        "camera further off": dataclasses.replace(
             shape, camera=dataclasses.replace(shape.camera, cam_from_world=pushed)
         ),
-        "pixels off by three": shape_with(shape, depth=shape.depth.roll(3, -1)),
+        "pixels off by three": dataclasses.replace(shape, depth=shape.depth.roll(3, -1)),
     }
     for name, each in wrong.items():
         assert not measure_consistency(each).holds, name
@@ -130,52 +127,24 @@ def test_problems_are_named(procedural, tmp_path):
     assert "5 problems" in report.summary()
 
 
-def edit_camera(path, **changes):
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-
-
 def halve(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def resize(path, size):
-    Image.open(path).resize((size, size)).save(path)
-
-
-def blank(path):
-    write_depth(path, torch.full((112, 112), torch.inf))
-
-
-def filled(path):
-    write_depth(path, torch.full((112, 112), 2.0))
-
-
-# What is done to the second view's files (or to all views of a shape), and what the line about it says.
+# What is done to the folder of a shape, and what the line about it says. How files can be broken: test_data_tree.py.
 DAMAGES = {
-    "a missing view": (lambda f: (f / "render_1.png").unlink(), r"render_1\.png is missing"),
+    "a picture cut short": (lambda f: halve(f / "render_1.png"), r"render_1\.png cannot be read"),
     "no last view": (
         lambda f: [(f / f"{kind}_3.{end}").unlink() for kind, end in FILES],
         r"3 views, elsewhere 4$",
     ),
-    "a picture cut short": (lambda f: halve(f / "render_1.png"), r"render_1\.png cannot be read"),
-    "a depth map cut short": (lambda f: halve(f / "depth_1.png"), r"depth_1\.png cannot be read"),
-    "a picture of another size": (
-        lambda f: resize(f / "render_1.png", 100),
-        r"pictures of view 1 are \(100, 100\)",
+    "an empty mask": (
+        lambda f: write_depth(f / "depth_1.png", torch.full((112, 112), torch.inf)),
+        "view 1 shows nothing",
     ),
-    "an empty mask": (lambda f: blank(f / "depth_1.png"), r"view 1 shows nothing"),
-    "no background": (lambda f: filled(f / "depth_1.png"), r"view 1 has no background"),
-    "no focal length": (
-        lambda f: edit_camera(f / "camera_1.json", K=[[0, 0, 56], [0, 0, 56], [0, 0, 1]]),
-        r"camera_1\.json cannot be read .*K cannot be inverted",
-    ),
-    "a pose that is none": (
-        lambda f: edit_camera(f / "camera_1.json", cam_from_world=np.diag([1, 0, 1, 1]).tolist()),
-        r"cam_from_world cannot be inverted",
-    ),
-    "a mirrored pose": (
-        lambda f: edit_camera(f / "camera_1.json", cam_from_world=np.diag([1, -1, 1, 1]).tolist()),
-        r"is no rotation",
+    "no background": (
+        lambda f: write_depth(f / "depth_1.png", torch.full((112, 112), 2.0)),
+        "view 1 has no background",
     ),
     "other depth": (
         lambda f: write_depth(f / "depth_1.png", read_depth(f / "depth_1.png") + 1),
@@ -241,3 +210,71 @@ def test_a_tree_of_ours_whose_clouds_were_turned_is_not_turned_back_in_silence(p
 def test_no_data(tmp_path):
     with pytest.raises(UserError, match="no data"):
         check_tree(tmp_path)
+
+
+# Contact sheets
+
+
+@pytest.fixture(scope="module")
+def lamps_and_cars(tmp_path_factory):
+    root = tmp_path_factory.mktemp("show") / "data"
+    generate(root, shapes=6, categories=["lamp", "car"], seed=0, size=64, views=3, processes=1)
+    return root
+
+
+def test_a_sheet_for_each_category(lamps_and_cars, tmp_path):
+    sheets = show(lamps_and_cars, tmp_path / "sheets", shapes=2)
+    assert sheets == {name: tmp_path / "sheets" / f"{name}.png" for name in ("lamp", "car")}
+    tall, wide, _ = np.asarray(Image.open(sheets["lamp"])).shape
+    assert (tall, wide) == (2 * (18 + 144), 7 * 144)
+    only = show(lamps_and_cars, tmp_path / "one", categories=["car"], shapes=50)
+    assert list(only) == ["car"]
+    assert np.asarray(Image.open(only["car"])).shape[0] == 3 * (18 + 144)
+
+
+def test_each_cell_shows_the_object_on_white(lamps_and_cars):
+    strip = strip_of(ShapeTree(lamps_and_cars, "train")[0], split="train")
+    title, cells = strip[:18], strip[18:].reshape(144, 7, 144, 3).transpose(1, 0, 2, 3)
+    assert 0.005 < (title < 200).any(-1).mean() < 0.2
+    for cell in cells:
+        assert 0.01 < (cell < 250).any(-1).mean() < 0.6
+        assert (cell[:3] > 250).all()
+    ink = [(cell < 250).any(-1) for cell in cells]
+    views, depth, cloud, behind = ink[:4], *ink[4:]
+    assert _overlap(views[0], depth) > 0.9
+    assert _overlap(views[0], cloud) > 0.75
+    assert _overlap(views[0], cloud) > _overlap(views[0], behind)
+    assert len(np.unique(cells[4][depth].reshape(-1, 3), axis=0)) > 100  # many depths, many colours
+    assert 55 < max(abs(np.argwhere(each) - 71.5).max() for each in ink) < 72  # the object fills its cells
+
+
+def _overlap(one, other):
+    return (one & other).sum() / (one | other).sum()
+
+
+def test_many_shapes_stand_in_columns():
+    strips = [np.full((2, 10, 3), k, np.uint8) for k in range(40)]
+    sheet = _arranged(strips)
+    assert sheet.shape == (20 * 2, 10 + 16 + 10, 3)
+    assert sheet[::2, 0, 0].tolist() == list(range(20))
+    assert sheet[::2, -1, 0].tolist() == list(range(20, 40))
+    assert _arranged(strips[:16]).shape == (32, 10, 3)
+    assert (_arranged(strips[:39])[-1, -1] == 255).all()
+
+
+def test_broken_shapes_are_left_out_and_mistakes_named(lamps_and_cars, tmp_path, capsys):
+    with pytest.raises(UserError, match="no shape of chair; it has: car, lamp"):
+        show(lamps_and_cars, tmp_path, categories=["chair"])
+    with pytest.raises(UserError, match="shapes must be"):
+        show(lamps_and_cars, tmp_path, shapes=0)
+    root = tmp_path / "broken"
+    generate(root, shapes=2, categories=["lamp"], seed=1, size=32, views=1, processes=1)
+    folders = sorted((root / tree_files.RENDERS).glob("*/*"))
+    (folders[0] / "depth_0.png").write_bytes(b"no")
+    assert main(["data", "show", str(root)]) == 0
+    assert "lamp: " in capsys.readouterr().out
+    assert np.asarray(Image.open(root / "contact" / "lamp.png")).shape[0] == 18 + 144
+    assert main(["data", "check", str(root)]) == 1
+    (folders[1] / "depth_0.png").write_bytes(b"no")
+    with pytest.raises(UserError, match="no shape of lamp can be read"):
+        show(root)

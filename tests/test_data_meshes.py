@@ -1,4 +1,4 @@
-"""Meshes of any make: good ones become shapes, bad ones are named, and none harms another."""
+"""Meshes of any format become shapes: where they are found, which way is up, what is wrong with bad ones."""
 
 import csv
 import zipfile
@@ -10,14 +10,25 @@ import trimesh
 from PIL import Image
 
 from train.data import ShapeTree, tree_files
-from train.data.mesh_sources import find_meshes, read_labels, shape_ids
-from train.data.meshes import LEFT_OUT, MeshError, MeshOptions, MeshReport, convert, load_surface
+from train.data.mesh_files import load_surface
+from train.data.mesh_sources import (
+    UPRIGHT,
+    MeshFile,
+    find_meshes,
+    keep_labelled,
+    of_category,
+    read_labels,
+    shape_ids,
+)
+from train.data.meshes import LEFT_OUT, MeshOptions, MeshReport, convert
 from train.data.rasterise import Rasteriser
 from train.data.render import Orbit, Renderer, draw_camera
 from train.data.visible_samples import sample_visible
 from train.errors import UserError
 
 SMALL = {"size": 32, "views": 2, "processes": 1}
+BOX = trimesh.creation.box((1.0, 2.0, 3.0))
+SHIPPED = Path(__file__).parents[1] / "train" / "data" / "furniture_labels.csv"
 
 
 def save_box(path, extents=(1.0, 2.0, 3.0)):
@@ -30,35 +41,52 @@ def all_shapes(root):
     return [shape for split in tree_files.SPLITS for shape in ShapeTree(root, split).iter_valid()]
 
 
+BAD = {  # name -> content, and what is said of it
+    "text.obj": ("Dear Sir or Madam,\nthis is a letter.\n", ""),
+    "no faces.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
+    "nan.obj": ("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN"),
+    "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no area"),
+    "point.obj": ("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no extent"),
+    "triangle.obj": ("v 0 0 0\nv 1 0.3 0.2\nv 0 1 0.5\nf 1 2 3\n", "flat: all its faces lie in one plane"),
+    "index.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", ""),
+    "empty.glb": (b"", "cannot be read"),
+    "noise.ply": (np.random.default_rng(0).bytes(500), "cannot be read"),
+}
+
+
 def bad_meshes(folder):
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "text.obj").write_text("Dear Sir or Madam,\nthis is a letter.\n")
-    (folder / "no faces.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    (folder / "nan.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    (folder / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
-    (folder / "point.obj").write_text("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n")
-    (folder / "index.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
-    (folder / "empty.glb").write_bytes(b"")
-    (folder / "noise.ply").write_bytes(np.random.default_rng(0).bytes(500))
-    return sorted(path.name for path in folder.iterdir())
+    """Each of them, a mesh thinner than a pixel, and one that is too large to be opened."""
+    folder.mkdir(parents=True)
+    for name, (content, _) in BAD.items():
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    save_box(folder / "needle.obj", (1.0, 0.0002, 0.0002))
+    with (folder / "huge.ply").open("wb") as file:
+        file.truncate(300 << 20)  # a hole: no space is taken
+    said = {name: reason for name, (_, reason) in BAD.items()}
+    return said | {"needle.obj": "shows nothing: the mesh is too thin", "huge.ply": "larger than 256 MB"}
 
 
 def test_good_ones_are_made_and_each_bad_one_is_named(tmp_path):
-    names = bad_meshes(tmp_path / "in" / "chairs")
+    said = bad_meshes(tmp_path / "in" / "chairs")
     for suffix in ("obj", "glb", "ply", "off", "stl"):
         save_box(tmp_path / "in" / "chairs" / f"box.{suffix}")
-    save_box(tmp_path / "in" / "Möbel und mehr" / "стул 1.obj")
-    report = convert([tmp_path / "in"], tmp_path / "out", labels=None, **SMALL)
+    save_box(tmp_path / "in" / "Möbel und mehr" / "стул 1.obj", (1.0, 2.0, 0.01))
+    report = convert([tmp_path / "in"], tmp_path / "out", size=16, views=4, processes=1)
     assert report.made == 6
-    assert sorted(failure.rpartition("/")[2] for failure in report.failures) == names
-    assert all(report.failures.values())
-    for name, reason in {"nan.obj": "NaN", "no faces.obj": "no faces", "point.obj": "no extent"}.items():
-        assert reason in report.failures[f"in: chairs/{name}"]
+    assert report.failures.keys() == {f"in: chairs/{name}" for name in said}
+    for name, reason in said.items():
+        found = report.failures[f"in: chairs/{name}"]
+        assert found
+        assert reason in found
         assert name in report.summary()
     assert report.categories == {"chair": 5, "unknown": 1}
     shapes = all_shapes(tmp_path / "out")
     assert len({shape.id for shape in shapes}) == 6
     assert all(shape.id.isascii() and " " not in shape.id for shape in shapes)
+    with (tmp_path / "out" / LEFT_OUT).open(newline="") as file:
+        assert dict(csv.reader(file)) == report.failures | {"mesh": "reason"}
+    convert([tmp_path / "in" / "chairs" / "box.obj"], tmp_path / "out", size=16, views=4, processes=1)
+    assert not (tmp_path / "out" / LEFT_OUT).exists()
 
 
 def test_surface_is_centred_with_diagonal_one_and_turned(tmp_path):
@@ -73,7 +101,7 @@ def test_surface_is_centred_with_diagonal_one_and_turned(tmp_path):
 def test_a_mesh_alone_that_is_unusable_leaves_nothing(tmp_path):
     bad_meshes(tmp_path / "in")
     with pytest.raises(UserError, match=r"no faces\.obj: no faces"):
-        convert([tmp_path / "in" / "no faces.obj"], tmp_path / "out", labels=None, **SMALL)
+        convert([tmp_path / "in" / "no faces.obj"], tmp_path / "out", **SMALL)
     assert not (tmp_path / "out").exists()
 
 
@@ -83,7 +111,7 @@ def test_wrong_sources_are_refused(tmp_path, name):
     (tmp_path / "broken.zip").write_text("no zip")
     (tmp_path / "nothing").mkdir()
     with pytest.raises(UserError, match=name):
-        convert([tmp_path / name], tmp_path / "out", labels=None, **SMALL)
+        convert([tmp_path / name], tmp_path / "out", **SMALL)
     assert not (tmp_path / "out").exists()
 
 
@@ -92,15 +120,21 @@ def test_an_archive_cannot_write_outside(tmp_path):
     with zipfile.ZipFile(tmp_path / "library.zip", "w") as archive:
         archive.writestr("../escaped.obj", obj)
         archive.writestr("/absolute.obj", obj)
+        archive.writestr(".", obj)
         archive.writestr("sofa/good.obj", obj)
     scratch = tmp_path / "deep" / "scratch"
     scratch.mkdir(parents=True)
     meshes, refused = find_meshes([tmp_path / "library.zip"], scratch)
     assert [mesh.inside for mesh in meshes] == ["sofa/good.obj"]
-    assert sorted(refused) == ["library.zip: ../escaped.obj", "library.zip: /absolute.obj"]
+    outside = "its path leads out of the archive"
+    assert refused == {
+        "library.zip: ../escaped.obj": outside,
+        "library.zip: /absolute.obj": outside,
+        "library.zip: .": "its path names no file",
+    }
     assert not list((tmp_path / "deep").glob("*.obj"))
-    report = convert([tmp_path / "library.zip"], tmp_path / "out", labels=None, **SMALL)
-    assert (report.made, report.categories, len(report.failures)) == (1, {"sofa": 1}, 2)
+    report = convert([tmp_path / "library.zip"], tmp_path / "out", **SMALL)
+    assert (report.made, report.categories, len(report.failures)) == (1, {"sofa": 1}, 3)
 
 
 def test_materials_and_textures_of_an_archive_reach_the_picture(tmp_path):
@@ -117,7 +151,7 @@ def test_materials_and_textures_of_an_archive_reach_the_picture(tmp_path):
     with zipfile.ZipFile(tmp_path / "library.sh3f", "w") as archive:
         for path in folder.iterdir():
             archive.write(path, f"display/{path.name}")
-    convert([tmp_path / "library.sh3f"], tmp_path / "out", labels=None, size=64, views=8, processes=1)
+    convert([tmp_path / "library.sh3f"], tmp_path / "out", size=64, views=8, processes=1)
     (shape,) = all_shapes(tmp_path / "out")
     eyes = shape.camera.position
     front = int(eyes[:, 2].argmax())
@@ -192,12 +226,15 @@ def test_labels_choose_and_name(tmp_path):
             ("lib", "b/model.obj", "garden gnome", "", "A gnome"),
             ("lib", "gone/model.obj", "chair", "03001627", "Gone"),
             ("another library", "x.obj", "chair", "03001627", "Not asked for"),
+            ("", "c/model.obj", "lamp", "", "In any library"),
+            ("", "gone.obj", "lamp", "", "Gone from all"),
         ],
     )
     report = convert([tmp_path / "lib"], tmp_path / "out", labels=labels, **SMALL)
-    assert report.categories == {"chair": 1, "garden_gnome": 1}
-    assert list(report.failures) == ["lib: gone/model.obj"]
-    assert sorted(shape.id for shape in all_shapes(tmp_path / "out")) == ["03001627/a", "garden_gnome/b"]
+    assert report.categories == {"chair": 1, "garden_gnome": 1, "lamp": 1}
+    assert sorted(report.failures) == ["labels.csv: gone.obj", "lib: gone/model.obj"]
+    ids = sorted(shape.id for shape in all_shapes(tmp_path / "out"))
+    assert ids == ["03001627/a", "03636649/c", "garden_gnome/b"]
 
 
 def test_labels_that_fit_nothing_or_are_none(tmp_path):
@@ -206,7 +243,7 @@ def test_labels_that_fit_nothing_or_are_none(tmp_path):
     headless = tmp_path / "headless.csv"
     headless.write_text("a,b\n1,2\n")
     for labels, message in (
-        (foreign, "speaks of other, the sources are lib"),
+        (foreign, "its libraries are other, the sources are lib"),
         (headless, "no column model, category"),
         (tmp_path / "missing.csv", "cannot be read"),
     ):
@@ -227,77 +264,12 @@ def test_what_is_no_model_is_not_even_a_failure(tmp_path):
     assert [mesh.inside for mesh in find_meshes([tmp_path], tmp_path / "none")[0]] == ["real.obj"]
 
 
-def test_a_shapenet_tree_keeps_its_names(tmp_path):
-    save_box(tmp_path / "ShapeNetCore.v1" / "03001627" / "1a2b3c" / "model.obj")
-    save_box(tmp_path / "ShapeNetCore.v1" / "02958343" / "4d5e6f" / "models" / "model_normalized.obj")
-    meshes, _ = find_meshes([tmp_path / "ShapeNetCore.v1"], tmp_path)
-    assert shape_ids(meshes) == ["02958343/4d5e6f", "03001627/1a2b3c"]
-
-
 def test_names_are_unique_even_where_letters_are_lost(tmp_path):
     for name in ("椅子.obj", "机.obj", "Stuhl.obj", "stuhl.obj", "a_b.obj", "a/b.obj"):
         save_box(tmp_path / name)
     ids = shape_ids(find_meshes([tmp_path], tmp_path / "none")[0])
     assert len({each.lower() for each in ids}) == 6
     assert all(each.isascii() for each in ids)
-
-
-def test_a_restarted_conversion_keeps_what_is_there(tmp_path):
-    save_box(tmp_path / "in" / "a.obj")
-    first = convert([tmp_path / "in"], tmp_path / "out", labels=None, **SMALL)
-    stamp = next((tmp_path / "out" / tree_files.RENDERS).glob("*/a/render_0.png")).stat().st_mtime_ns
-    save_box(tmp_path / "in" / "b.obj")
-    second = convert([tmp_path / "in"], tmp_path / "out", labels=None, **SMALL)
-    assert (first.made, second.made, second.kept) == (1, 1, 1)
-    assert next((tmp_path / "out" / tree_files.RENDERS).glob("*/a/render_0.png")).stat().st_mtime_ns == stamp
-
-
-def test_unreadable_is_a_mesh_error(tmp_path):
-    (tmp_path / "x.glb").write_bytes(b"glTF but not really")
-    with pytest.raises(MeshError, match="cannot be read"):
-        load_surface(tmp_path / "x.glb")
-
-
-def test_the_shipped_furniture_labels_are_whole():
-    labels = read_labels(Path(__file__).parents[1] / "train" / "data" / "furniture_labels.csv")
-    assert len(labels) == 246
-    assert len({(label.library, label.model) for label in labels}) == 246
-    assert len({label.synset for label in labels}) == 12
-
-
-def test_one_triangle_is_refused_as_flat_and_a_thin_board_is_not(tmp_path):
-    (tmp_path / "triangle.obj").write_text("v 0 0 0\nv 1 0.3 0.2\nv 0 1 0.5\nf 1 2 3\n")
-    with pytest.raises(MeshError, match="flat: all its faces lie in one plane"):
-        load_surface(tmp_path / "triangle.obj")
-    save_box(tmp_path / "board.obj", (1.0, 2.0, 0.001))
-    assert len(load_surface(tmp_path / "board.obj").faces) == 12
-
-
-def test_what_is_too_thin_for_its_pixels_is_named(tmp_path):
-    save_box(tmp_path / "in" / "needle.obj", (1.0, 0.0002, 0.0002))
-    save_box(tmp_path / "in" / "box.obj")
-    report = convert([tmp_path / "in"], tmp_path / "out", size=16, views=4, processes=1)
-    assert report.made == 1
-    assert "shows nothing of it" in report.failures["in: needle.obj"]
-
-
-def test_a_file_that_is_too_large_is_not_even_opened(tmp_path):
-    with (tmp_path / "huge.ply").open("wb") as file:
-        file.truncate(300 << 20)  # a hole: no space is taken
-    with pytest.raises(MeshError, match="larger than 256 MB"):
-        load_surface(tmp_path / "huge.ply")
-
-
-def test_what_was_left_out_is_written_down(tmp_path):
-    bad = tmp_path / "in" / "bad, or not.obj"
-    save_box(tmp_path / "in" / "good.obj")
-    bad.write_text("nothing")
-    convert([tmp_path / "in"], tmp_path / "out", **SMALL)
-    with (tmp_path / "out" / LEFT_OUT).open(newline="") as file:
-        assert list(csv.reader(file)) == [["mesh", "reason"], ["in: bad, or not.obj", "no faces"]]
-    bad.unlink()
-    convert([tmp_path / "in"], tmp_path / "out", **SMALL)
-    assert not (tmp_path / "out" / LEFT_OUT).exists()
 
 
 def test_a_long_list_is_cut_on_the_terminal(tmp_path):
@@ -324,37 +296,34 @@ def test_other_settings_into_the_same_folder_are_refused(tmp_path):
     assert len(all_shapes(tmp_path / "out")) == 1
 
 
-def test_other_sources_into_the_same_folder_are_added_and_counted(tmp_path):
-    for name in ("a", "b"):
+def test_a_second_run_adds_what_is_new_and_keeps_the_rest(tmp_path):
+    made = []
+    for name in ("a", "b", "b"):
         save_box(tmp_path / name / "model.obj")
         report = convert(
             [tmp_path / name], tmp_path / "out", options=MeshOptions(category=f"{name} kind"), **SMALL
         )
-    assert (report.made, report.kept, report.others) == (1, 0, 1)
+        made.append((report.made, report.kept, report.others))
+        stamp = next((tmp_path / "out" / tree_files.RENDERS).glob("a_kind/*/render_0.png")).stat().st_mtime_ns
+        made[-1] += (stamp,)
+    assert made == [(1, 0, 0, stamp), (1, 0, 1, stamp), (0, 1, 1, stamp)]
     assert report.categories == {"a_kind": 1, "b_kind": 1}
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "labels", "message"),
     [
-        (MeshOptions(up="w"), "up must be one of y, z, x, -y"),
-        (MeshOptions(scale=0.0), "scale must be positive"),
-        (MeshOptions(orbit=Orbit(distance=1.0)), "the frame cuts shapes"),
+        (MeshOptions(up="w"), None, "up must be one of y, z, x, -y"),
+        (MeshOptions(scale=0.0), None, "scale must be positive"),
+        (MeshOptions(orbit=Orbit(distance=1.0)), None, "the frame cuts shapes"),
+        (MeshOptions(category="chair"), "x.csv", "give one of them"),
     ],
 )
-def test_options_that_cannot_be_are_refused(tmp_path, options, message):
+def test_options_that_cannot_be_are_refused(tmp_path, options, labels, message):
     save_box(tmp_path / "a.obj")
     with pytest.raises(UserError, match=message):
-        convert([tmp_path / "a.obj"], tmp_path / "out", options=options, **SMALL)
+        convert(tmp_path / "a.obj", tmp_path / "out", labels=labels, options=options, **SMALL)
     assert not (tmp_path / "out").exists()
-
-
-def test_labels_and_category_are_one_too_many(tmp_path):
-    save_box(tmp_path / "a.obj")
-    with pytest.raises(UserError, match="give one of them"):
-        convert(
-            [tmp_path], tmp_path / "out", labels=tmp_path / "x.csv", options=MeshOptions(category="chair")
-        )
 
 
 def test_the_up_axis_and_the_cameras_reach_the_views(tmp_path):
@@ -420,3 +389,181 @@ def test_hidden_points_without_embree(tmp_path):
     camera = draw_camera(np.random.default_rng(0), 2, 64)
     points = sample_visible(renderer, camera, 300, np.random.default_rng(0))
     np.testing.assert_allclose(np.abs(points).max(1), 0.5 / np.sqrt(3), atol=1e-6)
+
+
+def save_textured(folder, name, images):
+    """A box as ShapeNet stores it: OBJ and MTL side by side, the texture in a folder, named relative to them."""
+    folder.mkdir(parents=True)
+    (folder / images).mkdir(parents=True)
+    Image.new("RGB", (4, 4), (200, 30, 30)).save(folder / images / "texture0.jpg")
+    (folder / f"{name}.mtl").write_text(f"newmtl wood\nKd 1 1 1\nmap_Kd {images}/texture0.jpg\n")
+    lines = [
+        f"mtllib {name}.mtl",
+        *(f"v {x} {y} {z}" for x, y, z in BOX.vertices),
+        "vt 0.5 0.5",
+        "usemtl wood",
+    ]
+    lines += [f"f {a}/1 {b}/1 {c}/1" for a, b, c in BOX.faces + 1]
+    (folder / f"{name}.obj").write_text("\n".join(lines))
+
+
+def test_shapenet_trees_of_both_versions_with_their_textures(tmp_path):
+    v1, v2 = tmp_path / "ShapeNetCore.v1", tmp_path / "ShapeNetCore.v2"
+    save_textured(v1 / "03001627" / "1a6f61", "model", "images")
+    save_textured(v1 / "02747177" / "ab12", "model", "images")  # trash bin: none of the paper's thirteen
+    save_textured(v2 / "02691156" / "10155655850468db" / "models", "model_normalized", "../images")
+    (v2 / "02691156" / "10155655850468db" / "models" / "model_normalized.solid.binvox").write_bytes(
+        b"#binvox"
+    )
+    (v2 / "taxonomy.json").write_text("[]")
+    report = convert([v1, v2], tmp_path / "out", **SMALL)
+    assert not report.failures
+    assert report.categories == {"02747177": 1, "chair": 1, "airplane": 1}
+    shapes = [
+        shape for split in tree_files.SPLITS for shape in ShapeTree(tmp_path / "out", split).iter_valid()
+    ]
+    assert {shape.id for shape in shapes} == {
+        "03001627/1a6f61",
+        "02747177/ab12",
+        "02691156/10155655850468db",
+    }
+    for shape in shapes:
+        seen = shape.depth.isfinite()
+        red, green, _ = shape.images.movedim(1, 0)
+        assert (red > 2 * green)[seen].float().mean() > 0.9  # the texture, not grey
+
+
+def test_textures_are_found_by_slashes_of_either_kind_and_only_in_the_library(tmp_path):
+    library = tmp_path / "library"
+    for name, texture in (("windows", r"..\..\pictures\x.jpg"), ("thief", "../../../secret/x.jpg")):
+        save_textured(library / "models" / name, "x", "images")
+        (library / "models" / name / "x.mtl").write_text(f"newmtl wood\nKd 1 1 1\nmap_Kd {texture}\n")
+    for folder in (library / "pictures", tmp_path / "secret"):
+        folder.mkdir()
+        Image.new("RGB", (4, 4), (200, 30, 30)).save(folder / "x.jpg")
+    meshes, _ = find_meshes([library], tmp_path)
+    textures = {
+        mesh.path.parent.name: len(load_surface(mesh.path, root=mesh.root).textures) for mesh in meshes
+    }
+    assert textures == {"windows": 1, "thief": 0}
+
+
+def test_a_shapenet_synset_as_a_zip(tmp_path):
+    BOX.export(tmp_path / "model.obj")
+    with zipfile.ZipFile(tmp_path / "03001627.zip", "w") as archive:
+        archive.write(tmp_path / "model.obj", "03001627/1a6f61/model.obj")
+    (tmp_path / "scratch").mkdir()
+    meshes, _ = find_meshes([tmp_path / "03001627.zip"], tmp_path / "scratch")
+    assert shape_ids(meshes) == ["03001627/1a6f61"]
+
+
+def test_single_files_are_what_their_folders_say(tmp_path):
+    for folder in ("sofas", "20240131", "attic"):
+        (tmp_path / folder).mkdir()
+        BOX.export(tmp_path / folder / "x.off")
+        meshes, _ = find_meshes([tmp_path / folder / "x.off"], tmp_path)
+        assert [mesh.synset for mesh in meshes] == ["04256520" if folder == "sofas" else "unknown"]
+
+
+def test_a_mesh_that_is_named_twice_counts_once_and_libraries_may_share_a_name(tmp_path):
+    for place in ("here", "there"):
+        (tmp_path / place / "models" / "sofa").mkdir(parents=True)
+        BOX.export(tmp_path / place / "models" / "sofa" / "x.off")
+    here, there = tmp_path / "here" / "models", tmp_path / "there" / "models"
+    meshes, _ = find_meshes([here, here / "sofa" / "x.off", here / ".." / "models", there], tmp_path)
+    assert [mesh.path.resolve() for mesh in meshes] == [here / "sofa" / "x.off", there / "sofa" / "x.off"]
+    first, second = shape_ids(meshes)
+    assert first.startswith("04256520/x-")
+    assert second == f"{first}-2"
+
+
+@pytest.mark.parametrize(
+    ("category", "synset"),
+    [
+        ("Chairs", "03001627"),
+        ("03001627", "03001627"),
+        ("02747177", "02747177"),
+        ("garden gnome", "garden_gnome"),
+    ],
+)
+def test_a_category_for_all(tmp_path, category, synset):
+    (tmp_path / "tables").mkdir()
+    BOX.export(tmp_path / "tables" / "x.off")
+    meshes, _ = find_meshes([tmp_path], tmp_path)
+    assert [mesh.synset for mesh in of_category(meshes, category)] == [synset]
+
+
+def test_each_axis_is_turned_up_and_none_is_mirrored(tmp_path):
+    BOX.export(tmp_path / "x.off")
+    for up, rotation in UPRIGHT.items():
+        matrix = np.eye(3) if rotation is None else np.reshape(rotation, (3, 3))
+        axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
+        np.testing.assert_array_equal(matrix @ axis, (0, 1, 0))
+        assert np.linalg.det(matrix) == pytest.approx(1)
+        (mesh,), _ = find_meshes([tmp_path / "x.off"], tmp_path, up=up)
+        extents = np.ptp(load_surface(mesh.path, mesh.rotation).vertices, axis=0) * np.sqrt(14)
+        assert extents[1] == pytest.approx({"x": 1, "y": 2, "z": 3}[up[-1]])
+
+
+def test_a_furniture_library_says_itself_which_way_is_up(tmp_path):
+    BOX.export(tmp_path / "x.obj")
+    catalogue = "id#1=a\nmodel#1=/a/x.obj\nid#2=b\nmodel#2=/b/x.obj\nmodelRotation#2=1 0 0 0 0 1 0 -1 0\n"
+    with zipfile.ZipFile(tmp_path / "lib.sh3f", "w") as archive:
+        archive.writestr("PluginFurnitureCatalog.properties", catalogue)
+        for folder in ("a", "b"):
+            archive.write(tmp_path / "x.obj", f"{folder}/x.obj")
+    (tmp_path / "scratch").mkdir()
+    meshes, _ = find_meshes([tmp_path / "lib.sh3f"], tmp_path / "scratch", up="-x")
+    assert [mesh.rotation for mesh in meshes] == [None, (1, 0, 0, 0, 0, 1, 0, -1, 0)]
+
+
+def labels_with(path, *turns):
+    lines = [f"a.zip,m{i}.obj,chair,{turn}\n" for i, turn in enumerate(turns)]
+    path.write_text("library,model,category,turn\n" + "".join(lines))
+    return read_labels(path)
+
+
+def matrix(rotation):
+    return np.reshape(rotation, (3, 3))
+
+
+def test_turns_are_right_handed_about_an_axis(tmp_path):
+    none, about_x, about_y, half = labels_with(tmp_path / "labels.csv", "", "x90", "y-90", " y180")
+    assert none.turn is None
+    lying = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # the head, the face, and the right-hand side
+    standing = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    assert np.array_equal(lying @ matrix(about_x.turn).T, standing)
+    assert np.array_equal(matrix(about_y.turn) @ [1, 0, 0], [0, 0, 1])
+    assert np.array_equal(matrix(half.turn), np.diag([-1, 1, -1]))
+
+
+def test_a_turn_follows_the_library_s_own_rotation(tmp_path):
+    labels = labels_with(tmp_path / "labels.csv", "y90", "y90", "")
+    own = tuple(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).ravel())  # z up -> y up
+    meshes = [
+        MeshFile(Path(f"m{i}.obj"), "a.zip", f"m{i}.obj", "unknown", rotation)
+        for i, rotation in enumerate((own, None, own))
+    ]
+    (both, turn, rotation), absent = keep_labelled(meshes, labels, tmp_path / "labels.csv")
+    assert not absent
+    assert np.array_equal(matrix(both.rotation) @ [0, 0, 1], [0, 1, 0])  # up, which a turn about y leaves
+    assert np.array_equal(matrix(both.rotation) @ [1, 0, 0], [0, 0, -1])
+    assert turn.rotation == labels[1].turn
+    assert rotation.rotation == own
+
+
+@pytest.mark.parametrize("turn", ["90", "w90", "x90.5", "yaw"])
+def test_a_turn_that_is_none_is_named(tmp_path, turn):
+    with pytest.raises(
+        UserError, match=r"labels\.csv: m0\.obj: the turn .* is not an axis and degrees, such as y90"
+    ):
+        labels_with(tmp_path / "labels.csv", turn)
+
+
+def test_the_shipped_furniture_labels_are_complete_and_stand_telephones_up():
+    labels = read_labels(SHIPPED)
+    assert len(labels) == len({(label.library, label.model) for label in labels}) == 246
+    assert len({label.synset for label in labels}) == 12
+    turned = {label.model.split("/")[-1]: label for label in labels if label.turn is not None}
+    for model in ("iphone.obj", "mobile.obj"):
+        assert np.array_equal(matrix(turned[model].turn) @ [0, 1, 0], [0, 0, 1])

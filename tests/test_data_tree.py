@@ -6,10 +6,14 @@ import shutil
 import numpy as np
 import pytest
 import scipy.io
+import torch
 import trimesh
 
+from diffpoint.io import write_depth
 from train.data import ShapeError, ShapeTree, tree_files
+from train.data.batches import load_split
 from train.data.render import Views, orbit_camera
+from train.data.tree import read_shape
 from train.errors import UserError
 
 SIZE = 16
@@ -65,7 +69,7 @@ def test_a_shape_appears_complete_or_not_at_all(tmp_path, monkeypatch):
 def test_leftovers_of_a_killed_run_are_cleared_and_never_listed(tmp_path):
     tree_files.prepare_output(tmp_path / "data", {"size": SIZE})
     write(tmp_path / "data", "03001627/one")
-    leftover = tmp_path / "data" / tree_files.RENDERS / "03001627" / ".writing-x"
+    leftover = tmp_path / "data" / tree_files.RENDERS / "03001627" / ".two.0badf00d.tmp"
     leftover.mkdir()
     assert tree_files.write_lists(tmp_path / "data", seed=0)["train"].keys() == {"03001627"}
     assert sum(len(ShapeTree(tmp_path / "data", split)) for split in tree_files.SPLITS) == 1
@@ -125,21 +129,48 @@ def test_no_data_says_how_to_make_some(tmp_path):
     with pytest.raises(UserError, match="python -m train data"):
         ShapeTree(tmp_path / "nothing")
     write(tmp_path, "03001627/one")
-    with pytest.raises(UserError, match="not finished"):
+    with pytest.raises(UserError, match="incomplete: no data_list"):
         ShapeTree(tmp_path)
+
+
+OUTSIDE = ["../../other/03001627/chair0", "/etc/passwd", "03001627/a/b", "03001627/", "..", "a\\b/c"]
+
+
+def test_lines_of_a_list_that_lead_elsewhere_are_refused_by_name(root):
+    """None of them is looked for, in the tree or in the folder of prepared shapes beside it."""
+    shutil.copytree(root, root.parent / "other" / tree_files.RENDERS)  # what the first would find
+    with (root / tree_files.LISTS / "train" / "03001627.list").open("a") as file:
+        file.write("\n".join(OUTSIDE))
+    tree = ShapeTree(root)
+    names = [line if "/" in line else f"03001627/{line}" for line in OUTSIDE]
+    assert list(tree.skipped) == names
+    assert all("not of the form <synset>/<model>" in reason for reason in tree.skipped.values())
+    assert not set(names) & set(tree.ids)
+    assert len(load_split(root, "train", image_size=(16, 16), map_size=16, progress=False)) == len(tree)
+    for name in names:
+        with pytest.raises(ShapeError, match="not of the form"):
+            read_shape(root, name)
 
 
 def truncate(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def edit(path, **changes):
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
 BREAKAGES = {
     "truncated image": ("render_1.png", truncate),
     "empty depth": ("depth_0.png", lambda path: path.write_bytes(b"")),
     "depth of 8 bits": ("depth_0.png", lambda path: shutil.copy(path.with_name("render_0.png"), path)),
+    "other sizes": ("depth_0.png", lambda path: write_depth(path, torch.ones(8, 8))),
     "missing depth": ("depth_1.png", lambda path: path.unlink()),
     "broken json": ("camera_0.json", lambda path: path.write_text('{"K": [[1')),
     "no camera": ("camera_0.json", lambda path: path.write_text('{"K": [[1]], "cam_from_world": [[NaN]]}')),
+    "no focal length": ("camera_0.json", lambda path: edit(path, K=[[0, 0, 8], [0, 0, 8], [0, 0, 1]])),
+    "no pose": ("camera_0.json", lambda path: edit(path, cam_from_world=np.diag([1, 0, 1, 1]).tolist())),
+    "mirror": ("camera_0.json", lambda path: edit(path, cam_from_world=np.diag([1, -1, 1, 1]).tolist())),
     "lacking key": ("camera_0.json", lambda path: path.write_text("{}")),
     "missing camera": ("camera_0.json", lambda path: path.unlink()),
     "truncated cloud": ("ply", truncate),
@@ -163,26 +194,10 @@ def test_a_broken_file_is_named_and_skipped(root, breakage):
     assert len(tree.load_all(progress=False)) == whole - 1
     assert list(tree.skipped) == [victim]
     assert victim in tree.skipped[victim]
-    assert file.name in tree.skipped[victim]
+    assert (file.name if breakage != "other sizes" else "pictures of view 0") in tree.skipped[victim]
     if breakage != "missing cloud":
         with pytest.raises(ShapeError, match=victim):
             tree[1]
-
-
-def test_views_of_different_sizes_are_no_shape(root):
-    victim = ShapeTree(root).ids[0]
-    other = root / "other"
-    tree_files.write_shape(other, "a/b", Views(*_flat_views(8)), np.zeros((3, 3)))
-    shutil.copy(
-        other / tree_files.RENDERS / "a/b/depth_0.png", tree_files.render_folder(root, victim) / "depth_0.png"
-    )
-    with pytest.raises(ShapeError, match="pictures of view 0"):
-        ShapeTree(root)[0]
-
-
-def _flat_views(size):
-    camera = orbit_camera(np.zeros(1), np.zeros(1), size)
-    return np.zeros((1, size, size, 3), np.uint8), np.ones((1, size, size), np.float32), camera
 
 
 def test_the_release_s_camera_files_are_read(root):

@@ -1,4 +1,4 @@
-"""Every op refuses what it cannot take, and says which argument, what was expected and what came."""
+"""Errors of every op name the argument, what is expected and what was passed."""
 
 from collections.abc import Callable
 

@@ -20,7 +20,14 @@ from train.errors import UserError
 from train.evaluation.runs import best_weights
 from train.experiments import store
 from train.experiments.frame import Experiment, Outcome, is_done, make_experiment
-from train.experiments.paper import TABLES, second_stage_without_diversity, without_codes, without_critic
+from train.experiments.paper import (
+    TABLES,
+    second_stage_alone,
+    second_stage_without_diversity,
+    with_critic,
+    without_codes,
+    without_critic,
+)
 from train.experiments.registry import ABOUT_ALL, EXPERIMENTS, load
 from train.experiments.run import make_all, run_experiment, write_page
 from train.experiments.statistics import claim, counted, resampled_means, verdict
@@ -134,19 +141,33 @@ def test_an_interrupted_training_is_finished_to_the_same_weights(trained: Study)
     assert json.loads((run / "trained.json").read_text())["continued"]
 
 
-def test_trainings_share_a_stage_1(fresh: Study) -> None:
-    plain, other = (
-        fresh.config(change, seed=0) for change in (without_critic, second_stage_without_diversity)
-    )
-    other = dataclasses.replace(other, stage1=plain.stage1)
-    other = dataclasses.replace(other, stage2=dataclasses.replace(plain.stage2, beta=0.0))
-    first, second = parts_of(plain), parts_of(other)
-    assert (len(first), first[0]) == (2, second[0]) and first[1] != second[1]
-    assert len(parts_of(fresh.config(unchanged, seed=0))) == 1  # its critic learns through both stages
-    single = scaled(fresh.config(of_method("psgn"), seed=0), 0.5)
-    assert not fresh.is_trained(single)
-    fresh.train(single)
-    assert fresh.is_trained(single)
+def test_trainings_share_their_stage_1(trained: Study) -> None:
+    config = trained.config(without_critic, seed=0)
+    variant = second_stage_without_diversity(config)
+    first, whole = parts_of(config)
+    assert (first.stage1, first.stage2.steps, whole) == (config.stage1, 0, config)
+    assert parts_of(stage1_of(variant)) == (first,)
+    trained.train_all([config, variant])
+    assert len({trained.run_of(part) for part in (first, config, variant)}) == 3
+    assert trained.train(config, stage=1) == trained.train(variant, stage=1) == trained.run_of(first)
+    weights = best_weights(trained.run_of(first), 1)
+    for each in (config, variant):
+        saved = json.loads((trained.run_of(each) / "config.json").read_text())
+        assert (saved["start"], saved["stage1"]["steps"]) == (str(weights), 0)
+        assert not best_weights(trained.run_of(each), 1).exists()
+    same, other = (trained.network(each, stage=1) for each in (config, variant))
+    assert all(torch.equal(a, b) for a, b in zip(same.parameters(), other.parameters(), strict=True))
+    # A critic learns through both stages, and a stage 1 that is missing or the only one cannot be separated.
+    for change in (with_critic, lambda c: second_stage_alone(without_critic(c)), of_method("psgn")):
+        whole = trained.config(change, seed=0)
+        assert parts_of(whole) == (whole,)
+
+
+def test_a_training_of_one_stage_is_finished_too(fresh: Study) -> None:
+    config = scaled(fresh.config(of_method("psgn"), seed=0), 0.5)
+    assert not fresh.is_trained(config)
+    fresh.train(config)
+    assert fresh.is_trained(config)
 
 
 @pytest.mark.slow
@@ -237,6 +258,31 @@ def test_every_table_of_the_paper_is_what_was_measured(name: str, trained: Study
     if name == "views":
         agreed = result["rows"]["4 views"]["consistency"]
         assert agreed["descended"] < agreed["searched"]
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
+def test_claims_hold_for_the_papers_own_values(table: Table) -> None:
+    paper = {row.name: row.paper for row in table.rows}
+    for each in (*table.claims, *table.category_claims):
+        try:
+            gain = each.gain(paper)
+        except KeyError:  # the paper has no value
+            continue
+        assert gain > 0, each.words
+
+
+def test_one_category_takes_half_the_steps_of_all_at_cpu(fresh: Study) -> None:
+    cpu = dataclasses.replace(fresh, profile="cpu", steps=None, category="display")
+    single, views = TABLES["single-category"], TABLES["views"]
+    of_one, of_all = (table.config(table.rows[-1], cpu, seed=0) for table in (single, views))
+    assert of_one.categories == ("display",) and of_all.categories == ()
+    psgn = cpu.config(of_method("psgn"), seed=0)
+    row = next(row for row in single.rows if row.name == "PSGN")
+    assert single.config(row, cpu, seed=0).stage1.steps == psgn.stage1.steps / 2
+    full = dataclasses.replace(cpu, profile="full")
+    assert (
+        single.config(row, full, seed=0).stage1.steps == full.config(of_method("psgn"), seed=0).stage1.steps
+    )
 
 
 def test_metrics_outlive_their_runs(trained: Study, tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
-"""The study of free clouds: its scenes are exact, its claims hold at a fraction of its length, and it resumes."""
+"""Front constraint against projection losses: scenes are exact, claims hold at a fraction of the length, results
+resume."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -11,15 +13,23 @@ import torch
 import trimesh
 from PIL import Image
 
-from diffpoint import chamfer_distance, unproject
+from diffpoint import PinholeCamera, chamfer_distance, unproject
+from models import Generator, build_generator
+from models.parts import PointDecoder
+from models.sizes import PROFILES as SIZES
 from train.__main__ import main
 from train.errors import UserError
-from train.evaluation.metrics import in_silhouette
-from train.experiments.front_vs_projection import networks_page, page
+from train.evaluation.metrics import in_silhouette, visible_error
+from train.experiments.front_vs_projection import experiment, networks_page, page
 from train.experiments.front_vs_projection.free_clouds import LOSSES, fit_cloud
+from train.experiments.front_vs_projection.networks import TRAININGS, configs, densities, verdict
 from train.experiments.front_vs_projection.shapes import Cameras, embedded_shape, shapes_of
-from train.experiments.front_vs_projection.study import run
+from train.experiments.run import run_experiment
+from train.experiments.study import Study
+from train.methods import get_method, recipe
+from train.methods.losses import Scene, supervise
 
+INFINITY = float("inf")
 ONE, TWO, SPHERE = Cameras(1), Cameras(2), Cameras(6, sphere=True)
 
 
@@ -98,50 +108,51 @@ def _numbers(found: dict) -> list[dict]:
     return [{k: v for k, v in fit.items() if k != "ms_per_iteration"} for fit in found["fits"]]
 
 
-def test_the_study_writes_what_it_measured_resumes_and_repeats_itself(tmp_path: Path):
-    settings = {"seeds": 1, "limit": 1, "iterations": 20, "settings": (ONE,), "progress": False}
-    found = run([], tmp_path / "a", **settings)
-    assert json.loads((tmp_path / "a" / "front-vs-projection.json").read_text()) == found
+def test_free_clouds_are_fitted_once_and_repeat_themselves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(experiment, "_SHAPES", 1)
+    monkeypatch.setattr(experiment, "RATES", (0.01, 0.03))
+    study = Study((), tmp_path, seeds=1, steps=20, progress=False)
+    found, drawn = experiment.free_clouds(study, settings=(ONE,))
     assert [fit["loss"] for fit in found["fits"]] == list(LOSSES)
-    text = (tmp_path / "a" / "front-vs-projection.md").read_text()
+    text = page.markdown(json.loads(json.dumps(found)))
     assert "0 exactly" in text
-    assert f"| {found['table'][ONE.name]['front']['visible_cd']['mean']:.2f} ± 0.00 |" in text
-    for name in ("front-vs-projection.png", "front-vs-projection-clouds.png"):
-        with Image.open(tmp_path / "a" / name) as picture:
-            assert picture.size[0] > 1000
-    with Image.open(tmp_path / "a" / "front-vs-projection-clouds.gif") as moving:
+    error = found["table"][ONE.name]["front"]["visible_cd"]
+    assert f"| {error['mean']:.2f} ± {error['sd']:.2f} |" in text
+    assert set(drawn) == {"", "-clouds"} and all(figure.get_size_inches()[0] > 8 for figure in drawn.values())
+    with Image.open(tmp_path / "front-vs-projection-clouds.gif") as moving:
         assert moving.n_frames == 21
 
-    cells = sorted((tmp_path / "a" / "free-clouds").iterdir())
+    cells = sorted((tmp_path / "free-clouds").iterdir())
     lost = next(path for path in cells if path.name.startswith("embedded_chair"))
     before = {path: path.stat().st_mtime_ns for path in cells}
     lost.unlink()
-    again = run([], tmp_path / "a", **settings)
+    monkeypatch.setattr(
+        experiment.page, "draw", lambda *_, **__: {}
+    )  # takes seconds, and fits nothing that is kept
+    again, _ = experiment.free_clouds(study, settings=(ONE,))
     assert _numbers(again) == _numbers(found)
-    changed = {path for path in cells if path.stat().st_mtime_ns != before[path]}
-    assert changed == {lost}
+    assert {path for path in cells if path.stat().st_mtime_ns != before[path]} == {lost}
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"iterations": 5}, "a fit of 5 steps goes nowhere"),
-        ({"seeds": 0}, "--seeds at least 1"),
-        ({"limit": 9}, "--limit must be 1 to 3"),
+        ({"steps": 5}, "a fit needs at least --steps 20; got 5"),
+        ({"limit": 9}, "--limit must be at most 3"),
+        ({"data": (Path("nowhere"),)}, "no such file"),
     ],
 )
-def test_numbers_out_of_range_are_refused(options, message, tmp_path: Path):
+def test_options_that_cannot_be_used_are_named(options, message, tmp_path: Path):
+    study = dataclasses.replace(Study((), tmp_path / "out", progress=False), **options)
     with pytest.raises(UserError, match=message):
-        run([], tmp_path / "out", progress=False, **options)
-    with pytest.raises(UserError, match="no such file"):
-        run([tmp_path / "nowhere"], tmp_path / "out", progress=False)
+        run_experiment("front-vs-projection", study)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_reaches_the_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_reaches_the_experiment(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     words = ["experiment", "front-vs-projection", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main([*words, "--steps", "5"]) == 2
-    assert "a fit of 5 steps goes nowhere" in capsys.readouterr().err
+    assert "a fit needs at least --steps 20" in capsys.readouterr().err
 
 
 def test_the_published_page_shows_what_was_measured():
@@ -152,3 +163,169 @@ def test_the_published_page_shows_what_was_measured():
     rows = [line for line in made.splitlines() if line.startswith("| ") and re.search(r" ± | to ", line)]
     assert len(rows) > 50
     assert [row for row in rows if row not in text] == []
+
+
+@pytest.mark.slow
+def test_networks_are_trained_measured_and_resumed(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the free clouds, which are tested above."""
+    monkeypatch.setattr(experiment, "free_clouds", lambda study: ({"fits": [], "table": {}}, {}))
+    monkeypatch.setattr(experiment.page, "markdown", lambda found: "free clouds\n")
+    for alike in ("projection", "soft"):
+        monkeypatch.delitem(TRAININGS, alike)
+    study = Study((tiny_data,), tmp_path, "smoke", seeds=1, limit=3, steps=2, progress=False)
+    monkeypatch.setattr("train.experiments.front_vs_projection.networks._VIEWS", 2)
+    networks = run_experiment("front-vs-projection", study)["networks"]
+    assert list(networks["single"]) == list(TRAININGS)
+    assert "horizon" not in networks["many"]
+    assert len(list((tmp_path / "runs").iterdir())) == len(configs(study)) == 5
+    front, horizon = (networks["single"][name]["stage1"] for name in ("front", "horizon"))
+    assert front["visible"]["by_seed"] != horizon["visible"]["by_seed"]
+    curve = networks["single"]["front"]["curves"][0]
+    assert curve["step"] == [0, 1, 2]
+    assert curve["left"] == curve["visible"][-1] / curve["visible"][0]
+    assert networks["floor"]["inside"] > 0.8
+    assert networks["floor"]["front_density"] == pytest.approx(1, abs=0.2)
+    text = (tmp_path / "front-vs-projection.md").read_text()
+    assert text.startswith("free clouds\n")
+    assert f"{front['visible']['mean']:.2f}" in text
+    for picture in ("networks", "predictions"):
+        assert (tmp_path / f"front-vs-projection-{picture}.png").stat().st_size > 10_000
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*")}
+    assert run_experiment("front-vs-projection", study)["networks"] == networks
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*")} == before
+
+
+def test_trainings_differ_in_their_loss_alone() -> None:
+    made = [training.config(recipe("ours", "cpu"), single=True) for training in TRAININGS.values()]
+    plain = {
+        dataclasses.replace(
+            config,
+            stage1=dataclasses.replace(config.stage1, supervision="front", visibility="zbuffer"),
+            stage2=dataclasses.replace(config.stage2, supervision="front", visibility="zbuffer"),
+        )
+        for config in made
+    }
+    assert len(set(made)) == len(TRAININGS)
+    assert len(plain) == 1
+    assert {training.colour for training in TRAININGS.values()} <= {loss.colour for loss in LOSSES.values()}
+
+
+def test_only_trees_are_trained_on(tiny_data: Path, tmp_path: Path) -> None:
+    study = Study((tmp_path, tiny_data, tmp_path / "mesh.obj"), tmp_path)
+    assert study.on_trees().data == (tiny_data,)
+
+
+def test_even_clouds_are_even_and_crowded_fronts_are_seen() -> None:
+    grid = torch.stack(torch.meshgrid(*[torch.linspace(-0.5, 0.5, 8)] * 3, indexing="ij"), -1).reshape(
+        1, -1, 3
+    )
+    seen = grid[..., 2] < 0
+    same = densities(grid, grid, seen)
+    assert same["front_density"].item() == pytest.approx(1)
+    assert same["imbalance"].item() == pytest.approx(0)
+    front_only = densities(grid[:, seen[0]].repeat(1, 2, 1), grid, seen)
+    assert front_only["front_density"].item() == pytest.approx(2)
+    assert (
+        0.3 < front_only["imbalance"].item() <= 0.5
+    )  # half of the points would have to move, to within a part
+
+
+def test_verdicts() -> None:
+    assert verdict(0.29, 0.9) == "converged"
+    assert verdict(0.5, 0.9) == "in between"
+    assert verdict(0.8, 0.9) == verdict(0.1, 0.49) == "did not converge"
+
+
+@pytest.fixture
+def plate() -> Scene:
+    """A plate 0.1 behind where a camera saw one, a point for each pixel."""
+    camera = PinholeCamera.look_at((0, 0, -2), focal_px=14.0, height=28, width=28)
+    across = (torch.arange(8, 20) + 0.5 - 14) / 14
+    x, y = torch.meshgrid(across, across, indexing="xy")
+    z = torch.full_like(x, 2.1)
+    points = torch.stack((-x * z, -y * z, z - 2), -1).reshape(1, -1, 3)
+    depth = torch.full((1, 1, 28, 28), INFINITY)
+    depth[..., 8:20, 8:20] = 2.0
+    return Scene(points, camera, depth)
+
+
+@pytest.mark.parametrize("front", ["emd", "chamfer"])
+def test_projection_losses_take_the_unit_of_the_front_constraint(plate: Scene, front: str) -> None:
+    stage = dataclasses.replace(recipe("ours", "cpu").stage1, front=front, supervision="projection")
+    value = supervise(plate, stage, step=0).loss.item()
+    expected = 0.1 * 144 * (56 / 28) ** 2 if front == "emd" else 100 * 0.1
+    assert value == pytest.approx(expected, rel=1e-4)
+    like = supervise(plate, dataclasses.replace(stage, supervision="front"), step=0).loss.item()
+    assert (1 if front == "emd" else 2) * expected == pytest.approx(like, rel=0.15)  # chamfer: both ways
+
+
+def test_every_supervision_has_a_gradient_and_soft_ones_sharpen(plate: Scene) -> None:
+    steps = recipe("ours", "cpu").stage1.steps
+    for supervision in ("front", "projection", "lin", "soft"):
+        stage = dataclasses.replace(recipe("ours", "cpu").stage1, supervision=supervision)
+        points = (plate.points + 0.02).requires_grad_()
+        logits = torch.full(points.shape[:2], 0.5).requires_grad_()
+        found = supervise(plate._replace(points=points, logits=logits), stage, step=steps)
+        found.loss.backward()
+        assert points.grad is not None
+        sideways = points.grad[..., :2].abs().max().item()
+        assert (sideways > 1e-4) == (supervision in ("front", "soft")), supervision
+        assert (logits.grad is not None) == (supervision == "lin")
+        assert ("matched_share" in found.shares) == (supervision == "front")
+    soft = dataclasses.replace(recipe("ours", "cpu").stage1, supervision="soft")
+    early, late = (supervise(plate, soft, step=step).loss.item() for step in (0, steps))
+    assert early != late
+
+
+def test_points_that_do_not_exist_are_replaced_by_those_that_do() -> None:
+    torch.manual_seed(0)
+    config = dataclasses.replace(recipe("ours", "smoke"), stage1=_lin(recipe("ours", "smoke").stage1))
+    model = get_method(config.system).build(config)
+    assert isinstance(model, Generator)
+    assert isinstance(model.decoder, PointDecoder)
+    assert model.config == dataclasses.replace(SIZES["smoke"], existence=True)
+    images, codes = torch.rand(2, 3, 64, 64), torch.randn(3, 2, model.code_dim)
+    predicted = model.predict(images, codes)
+    assert predicted.logits is not None
+    assert (predicted.logits > 0).all()  # fresh networks keep all points
+    assert torch.equal(model(images, codes), predicted.points)
+    with torch.no_grad():
+        model.decoder.fc_points.bias[3] = -10.0  # of the first point
+    logits = model.predict(images, codes).logits
+    assert logits is not None
+    assert (logits[..., 0] < 0).all()
+    shown = model(images, codes)
+    assert shown.shape == predicted.points.shape
+    assert torch.equal(shown[:, :, :-1], predicted.points[:, :, 1:])
+    assert torch.equal(shown[:, :, -1], predicted.points[:, :, 1])  # the first that exists, once more
+
+
+def test_supervision_belongs_to_our_own_system(tmp_path: Path) -> None:
+    config = dataclasses.replace(
+        recipe("ours", "smoke"), system="psgn", stage1=_lin(recipe("ours", "smoke").stage1)
+    )
+    with pytest.raises(UserError, match="supervision and visibility"):
+        get_method(config.system).build(config)
+    latent = dataclasses.replace(
+        recipe("ours", "smoke"), output_head="latent", stage1=_lin(recipe("ours", "smoke").stage1)
+    )
+    with pytest.raises(UserError, match="leave --ending at points"):
+        get_method(latent.system).build(latent)
+    with pytest.raises(ValueError, match="existence needs"):
+        build_generator(config=dataclasses.replace(SIZES["smoke"], existence=True, output_head="latent"))
+
+
+def _lin(stage):
+    return dataclasses.replace(stage, supervision="lin")
+
+
+def test_what_a_view_saw_is_what_is_measured(plate: Scene) -> None:
+    assert in_silhouette(plate.points, plate.camera, plate.depth).all()
+    assert visible_error(plate.points, plate.camera, plate.depth).item() == pytest.approx(20, rel=0.15)
+    outside = plate.points + torch.tensor([1.2, 0.0, 0.0])
+    assert in_silhouette(outside, plate.camera, plate.depth).float().mean() == pytest.approx(1 / 3)
+    assert in_silhouette(outside, plate.camera, plate.depth, margin=8).all()
+    gone = plate.points + torch.tensor([30.0, 0.0, 0.0])
+    assert not in_silhouette(gone, plate.camera, plate.depth, margin=28).any()

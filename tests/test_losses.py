@@ -1,4 +1,4 @@
-"""The paper's losses: against their plain twins, and what the paper claims of their gradients."""
+"""The paper's losses: counts, empty and unseen views, and what the paper claims of their gradients."""
 
 import itertools
 
@@ -6,8 +6,7 @@ import pytest
 import torch
 
 import diffpoint as dp
-from diffpoint import reference
-from diffpoint.testing import assert_close, check_gradients, tie_free_clouds
+from diffpoint.testing import assert_close, tie_free_clouds
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -31,26 +30,6 @@ def front_case(dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
     depth = torch.cat((depth, depth[1:].flip(1)))
     depth[0, 1] = depth[1, 1] = torch.inf
     return torch.cat((points.detach(), away)).requires_grad_(), depth
-
-
-@pytest.mark.parametrize("case", ["every map has points", "some maps are empty"])
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("distance", ["chamfer", "emd"])
-def test_front_terms_equal_the_reference_implementation(dtype, distance, case):
-    points, depth = scene(dtype) if case == "every map has points" else front_case(dtype)
-    view = camera(dtype)
-    K, cam_from_world = (m.expand(len(points), *m.shape) for m in (view.K, view.cam_from_world))
-    ours = dp.front_terms(points, view, depth, distance=distance, tolerance=1e-7).loss
-    theirs = reference.front_constraint(points, K, cam_from_world, depth, distance=distance)
-    assert_close(ours, theirs, scale=10)
-    weights = torch.arange(1, ours.numel() + 1, dtype=dtype).view(ours.shape)
-    x = torch.autograd.grad((ours * weights).sum(), points)[0]
-    y = torch.autograd.grad((theirs * weights).sum(), points)[0]
-    assert_close(x, y, scale=20)
-    hidden = ~dp.splat_depth(points, view).visible.any(1)
-    hidden[2:] = False  # compared as a whole
-    assert hidden.any()
-    assert (x[hidden] == 0).all()
 
 
 def test_front_terms_count_the_points_that_they_compared():
@@ -93,19 +72,6 @@ def test_a_batch_of_empty_depth_maps_has_loss_and_gradient_zero(distance):
     )
     (gradient,) = torch.autograd.grad(terms.loss.sum(), points)
     assert not any(value.any() for value in (*terms, gradient))
-
-
-def test_losses_pass_gradcheck():
-    points, depth = scene(count=15)
-    depth[0, 1] = torch.inf
-    for distance in ("chamfer", "emd"):
-        check_gradients(
-            lambda p, d=distance: dp.front_terms(p, camera(), depth, distance=d, tolerance=1e-6).loss, points
-        )
-    codes = torch.rand(3, 2, 5, dtype=torch.float64)
-    clouds = torch.rand(3, 2, 8, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    check_gradients(lambda c, s: dp.diversity_loss(c, s, alpha=0.3, tolerance=1e-6), codes, clouds)
-    check_gradients(lambda s: dp.consistency_loss(s, reduction="none"), clouds.transpose(0, 1))
 
 
 def test_the_projection_loss_moves_points_along_the_optical_axis_only_and_the_front_constraint_does_not():
@@ -159,20 +125,6 @@ def test_the_front_constraint_warns_of_an_empty_depth_map():
     assert dp.projection_loss(points, camera(torch.float32), torch.full_like(depth, torch.inf)) == 0
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_diversity_loss_equals_its_twin(dtype):
-    generator = torch.Generator().manual_seed(0)
-    codes = torch.randn(4, 2, 16, generator=generator, dtype=dtype)
-    clouds = torch.rand(4, 2, 20, 3, generator=generator, dtype=dtype).requires_grad_()
-    alpha = 20.0
-    ours = dp.diversity_loss(codes, clouds, alpha=alpha, tolerance=1e-5, reduction="none")
-    theirs = reference.diversity_loss(codes, clouds, alpha=alpha)
-    assert (theirs > 0).all()
-    assert_close(ours, theirs, scale=10)
-    x, y = (torch.autograd.grad(loss.sum(), clouds)[0] for loss in (ours, theirs))
-    assert_close(x, y, scale=50)
-
-
 def test_diversity_is_satisfied_by_shapes_that_differ_enough():
     codes = torch.tensor([[[0.0]], [[2.0]]])
     clouds = torch.zeros(2, 1, 6, 3)
@@ -182,17 +134,11 @@ def test_diversity_is_satisfied_by_shapes_that_differ_enough():
     assert dp.diversity_loss(codes, clouds[:1].expand(2, -1, -1, -1), alpha=4.0).item() == pytest.approx(2.0)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_consistency_loss_equals_its_twin_and_is_zero_for_agreement(dtype):
-    clouds = torch.rand(2, 4, 25, 3, generator=torch.Generator().manual_seed(0), dtype=dtype).requires_grad_()
-    ours, theirs = dp.consistency_loss(clouds, reduction="none"), reference.consistency_loss(clouds)
-    assert ours.shape == (2,)
-    assert_close(ours, theirs)
-    x, y = (torch.autograd.grad(loss.sum(), clouds)[0] for loss in (ours, theirs))
-    assert_close(x, y, scale=20)
+def test_consistency_is_the_mean_over_pairs_and_zero_for_equal_predictions():
+    clouds = torch.rand(4, 25, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     pairs = [
-        sum(dp.chamfer_distance(clouds[0, i], clouds[0, j], squared=False))
+        sum(dp.chamfer_distance(clouds[i], clouds[j], squared=False))
         for i, j in itertools.combinations(range(4), 2)
     ]
-    assert_close(ours[0], torch.stack(pairs).mean())
-    assert dp.consistency_loss(clouds[:, :1].expand(-1, 3, -1, -1)) == 0
+    assert_close(dp.consistency_loss(clouds), torch.stack(pairs).mean())
+    assert dp.consistency_loss(clouds[:1].expand(3, -1, -1)) == 0

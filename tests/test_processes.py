@@ -137,6 +137,32 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     assert all(ends(int(path.read_text())) for path in tmp_path.glob("*.pid"))
 
 
+_INTERRUPTED = """
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores it, and so its children
+from train.processes import run_in_processes
+print("begun", flush=True)
+try:
+    run_in_processes(time.sleep, [(60,)] * 4, processes=2, title="sleeps", progress=False)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+
+
+@pytest.mark.parametrize("after_seconds", [0.02, 0.2, 1.0])  # while they start, and when they have started
+def test_a_terminal_s_ctrl_c_reaches_the_workers_through_their_parent_only(after_seconds: float) -> None:
+    parent = subprocess.Popen(
+        [sys.executable, "-c", _INTERRUPTED], cwd=REPOSITORY, start_new_session=True, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert parent.stdout is not None
+    assert parent.stdout.readline() == "begun\n"
+    time.sleep(after_seconds)
+    os.killpg(parent.pid, signal.SIGINT)  # the terminal signals the whole group
+    out, errors = parent.communicate(timeout=60)
+    assert (out, errors) == ("interrupted\n", "")
+
+
 _SCRIPT = """
 import math, sys
 print("begun")

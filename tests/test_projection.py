@@ -1,13 +1,10 @@
-"""The projection losses: against their plain twins, and what they tell points in each direction."""
+"""The projection losses and the soft splat: directions of their gradients, limits and special cases."""
 
 import pytest
 import torch
 
 import diffpoint as dp
-from diffpoint import reference_projection as twins
-from diffpoint.testing import assert_close, check_gradients, tie_free_clouds
-
-DTYPES = (torch.float32, torch.float64)
+from diffpoint.testing import assert_close, tie_free_clouds
 
 
 def camera(dtype: torch.dtype = torch.float64) -> dp.PinholeCamera:
@@ -21,52 +18,6 @@ def scene(dtype: torch.dtype = torch.float64, count: int = 80) -> tuple[torch.Te
     points = tie_free_clouds(2, count, camera(), seed=2, dtype=dtype, margin=3e-4)
     logits = torch.randn(2, count, generator=torch.Generator().manual_seed(0), dtype=dtype)
     return points.requires_grad_(), logits.requires_grad_(), dp.splat_depth(truth, camera(dtype)).depth
-
-
-def matrices(dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
-    view = camera(dtype)
-    return view.K.expand(2, 2, 3, 3), view.cam_from_world.expand(2, 2, 4, 4)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("with_logits", [False, True])
-@pytest.mark.parametrize("upsample", [1, 3])
-def test_lins_loss_equals_its_twin(dtype, with_logits, upsample):
-    points, logits, depth = scene(dtype)
-    options = {"logits": logits if with_logits else None, "mask_weight": 0.3, "upsample": upsample}
-    ours = dp.projection_loss(points, camera(dtype), depth, reduction="none", **options)
-    theirs = twins.projection_loss(points, *matrices(dtype), depth, **options)
-    assert_close(ours, theirs, scale=10)
-    mean = dp.projection_loss(points, camera(dtype), depth, **options)
-    assert_close(mean, ours.mean())
-    leaves = (points, logits) if with_logits else (points,)
-    for x, y in zip(*(torch.autograd.grad(t.sum(), leaves) for t in (ours, theirs)), strict=True):
-        assert (y != 0).any()
-        assert_close(x, y, scale=20)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_the_soft_loss_equals_its_twin(dtype):
-    points, _, depth = scene(dtype)
-    options = {"radius": 2.3, "softness": 0.05, "mask_weight": 0.2}
-    ours = dp.soft_projection_loss(points, camera(dtype), depth, reduction="none", **options)
-    theirs = twins.soft_projection_loss(points, *matrices(dtype), depth, **options)
-    assert_close(ours, theirs, scale=50)
-    x, y = (torch.autograd.grad(t.sum(), points)[0] for t in (ours, theirs))
-    assert_close(x, y, scale=500)
-
-
-def test_losses_pass_gradcheck():
-    points, logits, depth = scene(count=15)
-    for upsample in (1, 2):
-        check_gradients(
-            lambda p, s, u=upsample: dp.projection_loss(
-                p, camera(), depth, logits=s, mask_weight=0.5, upsample=u
-            ),
-            points,
-            logits,
-        )
-    check_gradients(lambda p: dp.soft_projection_loss(p, camera(), depth, softness=0.1), points)
 
 
 def test_only_the_soft_loss_moves_points_sideways():
@@ -88,7 +39,7 @@ def test_only_the_soft_loss_moves_points_sideways():
 
 
 @pytest.mark.parametrize("at", [(-0.48, -0.1), (0.49, 0.3), (0.0, -0.49), (-0.55, 0.0), (0.52, -0.52)])
-def test_the_soft_loss_pulls_points_from_wherever_they_are_to_the_silhouette(at):
+def test_the_soft_loss_moves_points_towards_the_silhouette(at):
     """In the middle of the background, at the frame's edge, and just beyond it."""
     view = dp.PinholeCamera(torch.tensor([[30.0, 0, 15], [0, 30.0, 15], [0, 0, 1]]), torch.eye(4), 30, 30)
     depth = torch.full((1, 1, 30, 30), torch.inf)
@@ -102,7 +53,7 @@ def test_the_soft_loss_pulls_points_from_wherever_they_are_to_the_silhouette(at)
 
 @pytest.mark.parametrize("logit", [2.0, -2.0])
 def test_the_mask_term_raises_logits_inside_the_silhouette_and_lowers_those_outside(logit):
-    """Whether the points exist or not: it deletes them and brings them back."""
+    """Whether the points are rendered or not: it removes them and adds them again."""
     view = dp.PinholeCamera.look_at((0, 0, -2), focal_px=8.0, height=8, width=8)
     depth = torch.full((1, 1, 8, 8), torch.inf)
     depth[..., :, :4] = 2.0
@@ -114,7 +65,7 @@ def test_the_mask_term_raises_logits_inside_the_silhouette_and_lowers_those_outs
     assert gradient[0, 0] < 0 < gradient[0, 1]
 
 
-def test_points_that_do_not_exist_are_not_rendered():
+def test_points_with_a_negative_logit_are_not_rendered():
     points, logits, depth = scene(torch.float32)
     view = camera(torch.float32)
     few = logits.clone().detach()
@@ -168,7 +119,97 @@ def test_an_empty_map_and_an_empty_cloud_are_defined():
         ({"reduction": "sum"}, "'reduction' must be one of"),
     ],
 )
-def test_options_that_are_none_are_refused(options, message):
+def test_wrong_options_are_refused(options, message):
     points, _, depth = scene(torch.float32)
     with pytest.raises(ValueError, match=message):
         dp.projection_loss(points, camera(torch.float32), depth, **options)
+
+
+def soft_camera(dtype: torch.dtype = torch.float64) -> dp.PinholeCamera:
+    eyes = torch.tensor([[0.1, 0.3, -2.0], [2.0, -0.4, 0.2]], dtype=dtype)
+    return dp.PinholeCamera.look_at(eyes, focal_px=21.0, height=14, width=17)
+
+
+def cloud(count: int, dtype: torch.dtype = torch.float64, batch: int = 2) -> torch.Tensor:
+    random = torch.Generator().manual_seed(count)
+    return (torch.rand(batch, count, 3, generator=random, dtype=dtype) - 0.5).requires_grad_()
+
+
+def test_only_the_soft_splat_has_a_gradient_to_x_and_y():
+    view = dp.PinholeCamera(torch.tensor([[30.0, 0, 8], [0, 30.0, 7], [0, 0, 1]]), torch.eye(4), 14, 16)
+    points = torch.tensor([[[0.02, 0.01, 1.5], [0.05, 0.02, 1.7]]], requires_grad=True)
+    for depth, sideways in ((dp.splat_depth(points, view).depth, 0), (dp.soft_splat(points, view).depth, 1)):
+        seen = depth[torch.isfinite(depth)].square().sum()
+        (gradient,) = torch.autograd.grad(seen, points)
+        assert bool((gradient[..., :2] != 0).any()) == sideways
+        assert (gradient[..., 2] != 0).any()
+
+
+def test_a_small_softness_and_radius_give_the_hard_splat():
+    view, points = soft_camera(), cloud(300)
+    hard = dp.splat_depth(points, view, radius=1.2).depth
+    soft = dp.soft_splat(points, view, radius=1.2, softness=1e-9)
+    inside = soft.coverage > 0
+    assert torch.equal(torch.isfinite(soft.depth), inside)
+    assert inside.any()
+    assert (
+        torch.isfinite(hard) | ~inside
+    ).all()  # the hard disc includes the point's own pixel, and its edge
+    nearest = (hard - soft.depth)[inside & (hard == dp.splat_depth(points, view, radius=1.19).depth)]
+    assert len(nearest) > 100
+    assert_close(nearest, torch.zeros_like(nearest))
+
+
+def test_the_depth_lies_between_those_of_the_points_and_the_mask_below_one():
+    view, points = soft_camera(), cloud(200)
+    soft = dp.soft_splat(points, view, radius=4.0, softness=0.1)
+    z = dp.project(points, view).depth
+    hit = torch.isfinite(soft.depth)
+    for extreme, sign in ((z.amin(2), 1), (z.amax(2), -1)):
+        assert (sign * (soft.depth - extreme[..., None, None])[hit] >= -1e-12).all()
+    assert ((soft.mask >= 0) & (soft.mask <= 1)).all()
+    assert torch.equal(soft.mask > 0, hit)
+
+
+def test_the_order_of_the_points_changes_only_rounding():
+    view, points = soft_camera(), cloud(200)
+    one, other = (dp.soft_splat(p, view, softness=0.05) for p in (points, points.flip(1)))
+    assert_close(one.depth, other.depth, scale=100)
+    assert_close(one.coverage, other.coverage)
+
+
+def test_empty_clouds_and_points_behind_the_camera_leave_empty_maps():
+    view = soft_camera(torch.float32)
+    behind = torch.tensor([[[0.0, 0.0, -9.0]]]).expand(
+        2, 5, 3
+    )  # behind the first camera, beside the second's frame
+    for points, lengths in (
+        (torch.zeros(2, 0, 3), None),
+        (torch.zeros(2, 5, 3), torch.tensor([0, 0])),
+        (behind, None),
+        (torch.full((2, 5, 3), torch.nan), torch.tensor([0, 0])),
+    ):
+        points = points.clone().requires_grad_()
+        soft = dp.soft_splat(points, view, lengths=lengths)
+        assert soft.depth.shape == (2, 2, 14, 17)
+        assert torch.isinf(soft.depth).all()
+        assert (soft.coverage == 0).all()
+        (gradient,) = torch.autograd.grad(soft.coverage.sum(), points)
+        assert (gradient == 0).all()
+    assert dp.soft_splat(torch.zeros(0, 5, 3), view).depth.shape == (0, 2, 14, 17)
+
+
+def test_the_clouds_of_a_batch_do_not_affect_each_other():
+    points, view = cloud(50, torch.float32, batch=4), soft_camera(torch.float32)
+    whole = dp.soft_splat(points, view)
+    for b in range(4):
+        alone = dp.soft_splat(points[b : b + 1], view)
+        assert torch.equal(alone.depth[0], whole.depth[b])
+        assert torch.equal(alone.coverage[0], whole.coverage[b])
+
+
+@pytest.mark.parametrize("name", ["radius", "softness"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_radius_and_softness_must_be_positive(name, value):
+    with pytest.raises(ValueError, match=f"soft_splat: '{name}' must be positive and finite; got"):
+        dp.soft_splat(torch.zeros(1, 3, 3), soft_camera(torch.float32), **{name: value})

@@ -1,8 +1,8 @@
-"""Every op, thrown everything: it agrees with its twin, or raises an error of this library. Never NaN, never a crash.
+"""Every op on any input agrees with its reference implementation or raises an error of diffpoint; never NaN.
 
 Sizes from 0, both dtypes, strides, extreme coordinates, duplicates, collapsed and flat clouds, NaN and infinity: see
-`properties/strategies.py`. Where an input is refused is stated by each check, so that neither a missing refusal nor a
-needless one passes.
+`properties/strategies.py`. Each check states which inputs must raise an error; a missing error fails as well as a
+needless one.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
-from properties import distances, losses, projection, rendering
-from properties import strategies as throw
-from properties.judge import AGREED, REFUSED
+from properties import distances, losses, projection, rendering, strategies
+from properties.compare import AGREED, REFUSED
 
 import diffpoint as dp
 from diffpoint.visibility import METHODS
@@ -29,36 +28,38 @@ EXAMPLES = 20  # of every family of clouds, at every op
 def renderings(
     draw: st.DrawFn, largest: int, family: str, *, lengths: bool = True, radius: bool = True
 ) -> rendering.Rendering:
-    batch = draw(throw.sizes)
-    recipe = draw(throw.recipes(largest, family=family, batch=(batch,), lengths=lengths))
+    batch = draw(strategies.sizes)
+    recipe = draw(strategies.recipes(largest, family=family, batch=(batch,), lengths=lengths))
     radii = st.sampled_from([0.0, 0.0, 0.5, 1.0, 2.3, 50.0])
-    return rendering.Rendering(recipe, draw(throw.cameras(batch)), draw(radii) if radius else 0.0)
+    return rendering.Rendering(recipe, draw(strategies.cameras(batch)), draw(radii) if radius else 0.0)
 
 
 @st.composite
 def maps(draw: st.DrawFn, largest: int, family: str) -> rendering.Maps:
-    batch, views = draw(throw.sizes), draw(throw.sizes)
-    recipe = draw(throw.recipes(largest, family=family, batch=(batch,), lengths=False))
-    camera, target = (draw(throw.cameras(batch, draw(st.sampled_from([1, views])))) for _ in range(2))
-    return rendering.Maps(recipe, camera, target, draw(throw.depths), views)
+    batch, views = draw(strategies.sizes), draw(strategies.sizes)
+    recipe = draw(strategies.recipes(largest, family=family, batch=(batch,), lengths=False))
+    camera, target = (draw(strategies.cameras(batch, draw(st.sampled_from([1, views])))) for _ in range(2))
+    return rendering.Maps(recipe, camera, target, draw(strategies.depths), views)
 
 
-def batches(largest: int, family: str) -> st.SearchStrategy[throw.Recipe]:
+def batches(largest: int, family: str) -> st.SearchStrategy[strategies.Recipe]:
     """Batches with two leading dimensions; the losses want two of one or the other."""
     shapes = st.tuples(st.sampled_from([2, 2, 3, 1]), st.sampled_from([2, 2, 3, 1, 0]))
-    return shapes.flatmap(lambda batch: throw.recipes(largest, family=family, batch=batch, lengths=False))
+    return shapes.flatmap(
+        lambda batch: strategies.recipes(largest, family=family, batch=batch, lengths=False)
+    )
 
 
 def arguments(name: str, largest: int, family: str) -> tuple[st.SearchStrategy, ...]:
     """The strategies of a check's arguments; `largest` is the largest number of points."""
-    small = min(largest, 40)  # where the twin takes time with the cube of the number
+    small = min(largest, 40)  # the reference takes time cubic in the number of points
     return {
-        "nearest": (throw.pairs(largest, family),),
-        "chamfer_distance": (throw.pairs(largest, family),),
-        "earth_mover_distance": (throw.pairs(largest // 2, family),),
-        "approxmatch": (throw.pairs(largest // 2, family),),
+        "nearest": (strategies.pairs(largest, family),),
+        "chamfer_distance": (strategies.pairs(largest, family),),
+        "earth_mover_distance": (strategies.pairs(largest // 2, family),),
+        "approxmatch": (strategies.pairs(largest // 2, family),),
         "farthest_point_sample": (
-            throw.recipes(largest, family=family),
+            strategies.recipes(largest, family=family),
             st.integers(0, 40),
             st.sampled_from([0, 0, 0, 1, 40]),
         ),
@@ -93,10 +94,10 @@ CHECKS = {
 }
 
 
-def throw_at(name: str, *, largest: int, examples: int) -> Counter[str]:
-    """What came of every case; `examples` of each family of clouds."""
+def run_check(name: str, *, largest: int, examples: int) -> Counter[str]:
+    """Counts of the outcomes; `examples` cases of each family of clouds."""
     outcomes: Counter[str] = Counter()
-    for family in throw.FAMILIES:
+    for family in strategies.FAMILIES:
 
         @seed(
             zlib.crc32(f"{name} {family}".encode())
@@ -113,8 +114,8 @@ def throw_at(name: str, *, largest: int, examples: int) -> Counter[str]:
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_agrees_with_its_twin_or_refuses(name, record_property):
-    outcomes = throw_at(name, largest=300, examples=EXAMPLES)
+def test_agrees_with_the_reference_or_raises(name, record_property):
+    outcomes = run_check(name, largest=300, examples=EXAMPLES)
     record_property("cases", outcomes.total())
     assert outcomes[AGREED] >= 30
     assert outcomes[REFUSED] >= 3
@@ -122,20 +123,20 @@ def test_agrees_with_its_twin_or_refuses(name, record_property):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHECKS)
-def test_agrees_with_its_twin_or_refuses_at_length(name, record_property):
-    outcomes = throw_at(name, largest=3000, examples=2 * EXAMPLES)
+def test_agrees_with_the_reference_or_raises_at_length(name, record_property):
+    outcomes = run_check(name, largest=3000, examples=2 * EXAMPLES)
     record_property("cases", outcomes.total())
     assert outcomes[AGREED] >= 30
     assert outcomes[REFUSED] >= 3
 
 
-def test_every_op_is_thrown_at():
+def test_every_op_is_tested():
     within_front_constraint = {"front_sets", "front_terms"}
     functions = {name for name in dp.__all__ if name[0].islower()}
     assert functions - within_front_constraint - {"configure", "runtime_info"} == set(CHECKS)
 
 
-# What the above has found, kept by name.
+# Cases that the above has found.
 
 
 def test_nearest_leaves_the_padding_zero_where_the_other_set_is_empty():
@@ -144,7 +145,7 @@ def test_nearest_leaves_the_padding_zero_where_the_other_set_is_empty():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_approxmatch_does_not_look_at_the_padding(dtype):
+def test_approxmatch_ignores_the_padding(dtype):
     a, b = torch.rand(1, 20, 3, dtype=dtype), torch.rand(1, 20, 3, dtype=dtype)
     lengths = {"a_lengths": torch.tensor([11]), "b_lengths": torch.tensor([13])}
     before = dp.approxmatch(a, b, **lengths)
@@ -159,7 +160,7 @@ def test_projections_of_no_clouds_and_of_no_views():
     assert dp.reproject(torch.zeros(2, 0, 3, 2), camera, camera).valid.shape == (2, 0, 3, 2)
 
 
-def test_view_sampling_refuses_to_hand_on_nan():
+def test_view_sampling_refuses_nan():
     camera = dp.PinholeCamera.look_at((0, 0, -2), focal_px=4.0, height=4, width=4)
     splat = dp.splat_depth(torch.zeros(1, 2, 3), camera)
     points = torch.zeros(1, 2, 3)

@@ -16,7 +16,7 @@ from diffpoint import _bridge
 from diffpoint._launch import FastCall
 from diffpoint._runtime import RUNTIME
 
-BACKEND = dp.runtime_info().backend  # taichi, or quadrants where DIFFPOINT_BACKEND says so
+BACKEND = dp.runtime_info().backend  # taichi, or quadrants if DIFFPOINT_BACKEND is set to it
 USE = "import torch, diffpoint as dp; d = lambda: dp.nearest(torch.zeros(1, 4, 3), torch.ones(1, 5, 3))\n"
 
 

@@ -94,7 +94,7 @@ def test_several_trees_are_put_together_whatever_the_size_of_their_renders(
     tiny_data: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / "other"
-    generate(other, shapes=6, categories=["table"], seed=1, size=96, views=4, processes=1)
+    generate(other, shapes=5, categories=["table"], seed=1, size=96, views=4, processes=1)
     both = load_split([tiny_data, other], "train", image_size=(48, 64), map_size=16, progress=False)
     alone = [
         load_split(root, "train", image_size=(48, 64), map_size=16, progress=False)

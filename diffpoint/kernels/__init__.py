@@ -1,6 +1,6 @@
-"""Taichi kernels: no torch here. Each module has `build(real)`, which makes its kernels for one float type.
+"""Taichi kernels, without torch. Each module has `build(real)`, which makes its kernels for one float type.
 
-Every kernel ends in the argument `spread`. Its outer loop runs over `count * spread` and acts where the counter is a
-multiple of `spread`: Taichi's default settings run a loop of up to 512 iterations on a single thread, so in a program
-that started Taichi itself `spread` is 512, and 1 where diffpoint chose the settings.
+The last argument of every kernel is `spread`. Its outer loop has `count * spread` iterations, of which only every
+`spread`-th does work: with Taichi's default settings a loop of up to 512 iterations runs on one thread, so `spread`
+is 512 in a program that started Taichi itself, and 1 if diffpoint started it with other settings.
 """

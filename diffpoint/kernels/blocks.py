@@ -1,4 +1,4 @@
-"""Clouds sorted along a Morton curve and cut into boxes, so that whole blocks of points can be passed over."""
+"""Clouds sorted along a Morton curve and cut into boxes, so that searches can skip whole blocks of points."""
 
 from types import SimpleNamespace
 
@@ -14,11 +14,11 @@ def build(real):
     boxes3 = ti.types.ndarray(dtype=real, ndim=3)
     counts1 = ti.types.ndarray(dtype=ti.i64, ndim=1)
     indices2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
-    outside = ti.math.inf  # the padding: never nearest, never within reach
+    outside = ti.math.inf  # the padding: never the nearest point
 
     @ti.func
     def spread_bits(x: ti.i32):
-        """Bits 0, 1, 2, ... to places 0, 3, 6, ...; up to ten of them."""
+        """Moves bits 0, 1, 2, ... to positions 0, 3, 6, ...; at most ten bits."""
         x = (x | (x << 16)) & 0x030000FF
         x = (x | (x << 8)) & 0x0300F00F
         x = (x | (x << 4)) & 0x030C30C3
@@ -40,8 +40,8 @@ def build(real):
     ):
         """Counting sort by Morton key with `bits` bits for each axis, then the boxes of every 32 points.
 
-        Within a box the points keep their order. ordered has whole boxes, filled up with infinity. order: where each
-        sorted point came from. boxes and groups: (B, 6, count) least and greatest corners.
+        Within a box the points keep their order. ordered: padded to whole boxes with infinity. order: index of each
+        sorted point before sorting. boxes and groups: (B, 6, count) minimum and maximum corners.
         """
         for step in range(points.shape[0] * spread):
             if step % spread == 0:

@@ -1,7 +1,7 @@
 """Nearest neighbours: a tile of queries in registers against candidates broadcast one by one.
 
-`forward` tries every candidate; `forward_blocks` passes over boxes of candidates that are farther from the whole tile
-than what each of its queries has found. Both give the same distances and the same indices.
+`forward` tries every candidate; `forward_blocks` skips boxes of candidates that are farther from the whole tile than
+the nearest candidate found so far by each of its queries. Both give the same distances and the same indices.
 """
 
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ from diffpoint.kernels.blocks import BLOCK, GROUP, LANES
 
 CHUNK = 32  # candidates between two updates of the winning chunk
 ROWS = GROUP // LANES  # rows of boxes in a group
-BOX_TILE = 16  # queries that go through the boxes together; 32 are no faster and compile in twice the time
+BOX_TILE = 16  # queries that are compared with the boxes together; 32 are no faster and compile twice as long
 
 
 def build(real):
@@ -25,7 +25,7 @@ def build(real):
 
     @ti.func
     def clamped(x, least, greatest):
-        """The coordinate nearest to `x` from least to greatest."""
+        """`x` clamped to the interval from `least` to `greatest`."""
         y = ti.select(x < least, least, x)
         return ti.select(y > greatest, greatest, y)
 
@@ -59,7 +59,7 @@ def build(real):
 
     @ti.func
     def most_central(corners: ti.template(), cloud, start, end, low: ti.template(), high: ti.template()):
-        """Of the boxes `start` to `end`, the one whose centre is nearest to that of `low` to `high`."""
+        """Of the boxes `start` to `end`, the one whose centre is nearest to that of the box `low` to `high`."""
         least = real(ti.math.inf)
         best = start
         for box in range(start, end):
@@ -97,8 +97,8 @@ def build(real):
                     least = ti.Vector([real(ti.math.inf) for s in ti.static(range(tile))])
                     winner = ti.Vector([0 for s in ti.static(range(tile))])
                     for chunk in range((m + CHUNK - 1) // CHUNK):
-                        # Only the minimum is tracked among the candidates of a chunk; which of them it was is
-                        # found by scanning the winning chunk again. This keeps the inner loop packed.
+                        # Within a chunk only the minimum is tracked; its index is found afterwards by scanning
+                        # that chunk again. This keeps the inner loop vectorised.
                         current = least
                         for j in range(chunk * CHUNK, ti.min(chunk * CHUNK + CHUNK, m)):
                             x = b[cloud, j, 0]
@@ -120,7 +120,7 @@ def build(real):
                             for r in ti.static(range(tile)):
                                 chunk = ti.select(r == s, winner[r], chunk)
                             best = real(ti.math.inf)
-                            best_j = -1  # stays where every squared distance is beyond the number format
+                            best_j = -1  # remains if every squared distance overflows
                             for j in range(chunk * CHUNK, ti.min(chunk * CHUNK + CHUNK, m)):
                                 dx = b[cloud, j, 0] - a[cloud, i, 0]
                                 dy = b[cloud, j, 1] - a[cloud, i, 1]
@@ -152,7 +152,7 @@ def build(real):
         index: indices,
         spread: ti.i32,
     ):
-        """`a` and `b` as sorted by `blocks.sort`; results go to the points' places before sorting.
+        """`a` and `b` as sorted by `blocks.sort`; results are stored in the order before sorting.
 
         `corners` and `box_lanes` are the same memory: the boxes of `b`.
         """
@@ -179,8 +179,8 @@ def build(real):
                     least = ti.Vector([real(ti.math.inf) for s in ti.static(range(BOX_TILE))])
                     winner = ti.Vector([-1 for s in ti.static(range(BOX_TILE))])
                     farthest = real(ti.math.inf)  # of the nearest found so far, over the tile
-                    # First the box in the middle of the tile, then the rest of its group, then the other groups:
-                    # what is found first lets most of the rest be passed over.
+                    # First the nearest box, then the rest of its group, then the other groups: with a near
+                    # candidate found first, most of the rest is skipped.
                     count = corners.shape[2] // GROUP
                     own_group = most_central(groups, cloud, 0, count, low, high)
                     own_box = most_central(
@@ -233,7 +233,7 @@ def build(real):
                                             source[s] = ti.select(nearer, before_sorting, source[s])
                                             current[s] = ti.select(nearer, e, current[s])
                                     for s in ti.static(range(BOX_TILE)):
-                                        # Of equally near ones the one that came first before sorting.
+                                        # In a tie the one with the lowest index before sorting.
                                         other = winner[s]
                                         first_of_equals = ti.select(source[s] < other, source[s], other)
                                         equal = ti.select(current[s] == least[s], first_of_equals, other)
@@ -245,7 +245,7 @@ def build(real):
                                     farthest = current.max()
                     for s in ti.static(
                         range(BOX_TILE)
-                    ):  # the last point's result more than once, without a branch
+                    ):  # without a branch; the last point's result may be stored repeatedly
                         place = a_order[cloud, ti.min(first + s, n - 1)]
                         squared_distance[cloud, place] = least[s]
                         index[cloud, place] = winner[s]
@@ -265,7 +265,7 @@ def build(real):
         grad_b: clouds,
         spread: ti.i32,
     ):
-        # One thread owns one cloud: it scatters without atomics, in a fixed order, to what the gradients hold.
+        # One thread per cloud adds to the gradients in a fixed order, without atomics.
         for step in range(a.shape[0] * spread):
             if step % spread == 0:
                 cloud = step // spread

@@ -40,7 +40,7 @@ def build(real):
                     z = points[source + 2]
                     d = m[8] * x + m[9] * y + m[10] * z + m[11]
                     sum_of_depths += d
-                    inverse = real(1.0) / d  # as in the splat, so that both put a point in the same pixel
+                    inverse = real(1.0) / d  # as in the splat, so that both assign a point to the same pixel
                     u = (m[0] * x + m[1] * y + m[2] * z + m[3]) * inverse
                     v = (m[4] * x + m[5] * y + m[6] * z + m[7]) * inverse
                     target = view * count + i
@@ -75,9 +75,9 @@ def build(real):
         count: ti.i32,
         spread: ti.i32,
     ):
-        """One thread owns one cloud and all its views. (`a[i] += x` would be an atomic addition, and slow.)
+        """One thread per cloud handles all its views. (`a[i] += x` would be a slow atomic addition.)
 
-        A step of 0 makes of one tile's gradients those of everything.
+        With a step of 0 the gradients of one tile are used for all.
         """
         tiles = count // TILE
         for step in range(points.shape[0] // (3 * count) * spread):
@@ -86,7 +86,7 @@ def build(real):
                 for view in range(cloud * views, cloud * views + views):
                     first = view == cloud * views
                     m = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
-                    # Sums for the matrix: rows 0 to 2 of the gradients times x, y, z and 1, in each lane of the tile.
+                    # Sums for the matrix: rows 0 to 2 of the gradients times x, y, z and 1, for each lane of the tile.
                     x0 = ti.Vector([real(0.0) for _ in ti.static(range(TILE))])
                     y0, z0, w0, x1, y1, z1, w1, x2, y2, z2, w2 = x0, x0, x0, x0, x0, x0, x0, x0, x0, x0, x0
                     for t in range(tiles):
@@ -121,7 +121,7 @@ def build(real):
                         grad_x = g0 * m[0] + g1 * m[4] + g2 * m[8]
                         grad_y = g0 * m[1] + g1 * m[5] + g2 * m[9]
                         grad_z = g0 * m[2] + g1 * m[6] + g2 * m[10]
-                        if not first:  # once for the whole tile: in each lane it would be a branch
+                        if not first:  # once per tile, because it would be a branch in each lane
                             for s in ti.static(range(TILE)):
                                 grad_x[s] += grad_points[source + 3 * s]
                                 grad_y[s] += grad_points[source + 3 * s + 1]
@@ -168,7 +168,7 @@ def build(real):
         lengths: integers,
         spread: ti.i32,
     ):
-        """Pixel centres at their depth, the foreground only, one behind the other."""
+        """World points of the foreground pixels, stored contiguously."""
         for step in range(depth.shape[0] * spread):
             if step % spread == 0:
                 view = step // spread
@@ -223,7 +223,7 @@ def build(real):
 
     @ti.func
     def pixel_to_world(b: ti.template(), u, v, depth):
-        """The direction from the camera to a pixel, which its depth multiplies, and the world point."""
+        """The direction from the camera to a pixel, to be multiplied by the depth, and the world point."""
         ray_x = b[0] * u + (b[1] * v + b[2])
         ray_y = b[4] * u + (b[5] * v + b[6])
         ray_z = b[8] * u + (b[9] * v + b[10])
@@ -231,7 +231,7 @@ def build(real):
 
     @ti.func
     def all_infinite(depth: ti.template()):
-        """Whether a tile is empty: most are, or none is. NaN is not infinite."""
+        """Whether all pixels of a tile are empty; NaN is not."""
         count = 0
         for s in ti.static(range(TILE)):
             count += ti.select(depth[s] == real(ti.math.inf), 1, 0)
@@ -346,7 +346,7 @@ def build(real):
 
     @ti.func
     def add_row(total: ti.template(), i: ti.template(), sums: ti.template(), k: ti.template(), v):
-        """Sums along a row of pixels, of gradients times u d, d and 1, to a matrix's gradient."""
+        """Adds sums along a row of pixels (gradients times u d, d and 1) to a matrix's gradient."""
         total[i] += sums[k]
         total[i + 1] += sums[k + 1] * v
         total[i + 2] += sums[k + 1]
@@ -370,7 +370,7 @@ def build(real):
         width: ti.i32,
         spread: ti.i32,
     ):
-        """A step of 0 makes of one tile's gradients those of everything.
+        """With a step of 0 the gradients of one tile are used for all.
 
         Both matrices' gradients are sums of gradients times (u d, v d, d, 1): of those to the world points, and of
         those to the target's rows, whose (x, y, z, 1) are `back_projection` times the same four.
@@ -387,7 +387,7 @@ def build(real):
                     v = ti.cast(row, real) + real(0.5)
                     u = ti.Vector([ti.cast(s, real) + real(0.5) for s in ti.static(range(TILE))])
                     start = (view * height + row) * width
-                    # Sums along the row, in each lane of the tile: of the gradients times u d, d and 1.
+                    # Sums along the row of the gradients times u d, d and 1, for each lane of the tile.
                     none = ti.Vector([real(0.0) for _ in ti.static(range(TILE))])
                     x0, x1, x2, y0, y1, y2, z0, z1, z2 = none, none, none, none, none, none, none, none, none
                     p0, p1, p2, q0, q1, q2, r0, r1, r2 = none, none, none, none, none, none, none, none, none

@@ -1,4 +1,4 @@
-"""Farthest point sampling, with every distance updated at every step, or only those in boxes a step can reach."""
+"""Farthest point sampling: updates every distance at every step, or only those in boxes that a new point can change."""
 
 from types import SimpleNamespace
 
@@ -25,7 +25,7 @@ def build(real):
         start: ti.i32,
         spread: ti.i32,
     ):
-        """`distance` comes in as +inf for points and -1 for padding, which is therefore never the farthest."""
+        """`distance` must be +inf for points and -1 for padding, which is therefore never the farthest."""
         for step in range(points.shape[0] * spread):
             if step % spread == 0:
                 cloud = step // spread
@@ -81,9 +81,9 @@ def build(real):
     ):
         """`points`, `order`, `box_lanes` as sorted by `blocks.sort`; `distance` +inf, and -1 in the padding.
 
-        A new point changes distances only in boxes that lie nearer to it than their farthest distance. Equal
-        distances go to the lowest index before sorting, as in the plain algorithm: the first within a box, whose
-        points keep their order.
+        A new point changes distances only in boxes that are nearer to it than the largest distance in them. In a tie
+        the lowest index before sorting is chosen, as in the plain algorithm: the first within a box, because points
+        keep their order there.
         """
         for step in range(points.shape[0] * spread):
             if step % spread == 0:

@@ -1,4 +1,4 @@
-"""Soft splatting: footprints that fade to their edge, and a soft minimum of the depths of those that overlap."""
+"""Soft splatting: footprints that fade towards their edge, and a soft minimum of the depths where they overlap."""
 
 from types import SimpleNamespace
 
@@ -11,7 +11,7 @@ def build(real):
 
     @ti.func
     def window(u, v, d, size, radius):
-        """First and last (exclusive) column and row whose centres the disc may reach; empty behind the camera."""
+        """First and last (exclusive) column and row whose centres the disc may cover; empty behind the camera."""
         bounds = ti.Vector([0, 0, 0, 0])
         half = real(0.5)
         zero = real(0.0)
@@ -46,7 +46,7 @@ def build(real):
         softness: real,
         spread: ti.i32,
     ):
-        """One thread owns one map. Weights are relative to the nearest depth so far: a nearer point rescales them."""
+        """One thread per map. Weights are relative to the nearest depth so far: a nearer point rescales them."""
         zero = real(0.0)
         one = real(1.0)
         size = ti.Vector([ti.cast(height, real), ti.cast(width, real)])
@@ -105,7 +105,7 @@ def build(real):
         softness: real,
         spread: ti.i32,
     ):
-        """One thread owns the points of one view and gathers from their pixels."""
+        """One thread per view gathers from the pixels of its points."""
         zero = real(0.0)
         one = real(1.0)
         size = ti.Vector([ti.cast(height, real), ti.cast(width, real)])
@@ -135,7 +135,7 @@ def build(real):
                                 p = start + row * width + column
                                 g = grad_coverage[p]
                                 share = ti.exp((nearest[p] - d) / softness)
-                                if share > zero:  # else 0 times what may be infinite
+                                if share > zero:  # else 0 times infinity is possible
                                     pull = grad_depth[p] * share / weight[p]
                                     off = d - depth[p]
                                     g += pull * off

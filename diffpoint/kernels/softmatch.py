@@ -1,4 +1,4 @@
-"""The soft matching of the paper's released code: masses meet over shorter, then longer distances."""
+"""The soft matching of the paper's released code: masses are matched at short, then at longer distances."""
 
 from types import SimpleNamespace
 
@@ -6,7 +6,7 @@ from diffpoint.kernels._backend import ti
 
 LANES = 16
 LEVELS = 10  # exponents -4^7, -4^6, ..., -4^-1, and 0
-# 2^x on [-1, 0] by powers of x, highest first: the polynomial of least relative error (2e-9) that is 1 at 0.
+# Coefficients of 2^x on [-1, 0], highest power first: minimax in relative error (2e-9), exactly 1 at 0.
 POLYNOMIAL = (
     0.000109023228318475,
     0.0012747482896728335,
@@ -27,7 +27,7 @@ def build(real):
 
     @ti.func
     def exp2(x):
-        """2^x for x <= 0, lane by lane; in float32 as a polynomial, which packs, to 1e-7 of its value."""
+        """2^x for x <= 0, lane by lane; in float32 a polynomial, which is vectorised, with a relative error of 1e-7."""
         y = x
         if ti.static(real == ti.f32):
             for s in ti.static(range(LANES)):
@@ -99,9 +99,9 @@ def build(real):
         with_gradient: ti.i32,
         spread: ti.i32,
     ):
-        """supply and demand come in as the masses of `a` and `b`, 0 in the padding; a `_flat` array is the same memory.
+        """supply and demand must be the masses of `a` and `b`, 0 in the padding; a `_flat` array is the same memory.
 
-        The match itself is never stored: cost and the sums of unit vectors it weights are built up level by level.
+        The match itself is never stored: the cost and the weighted sums of unit vectors are accumulated level by level.
         """
         for step in range(a.shape[0] * spread):
             if step % spread == 0:

@@ -1,4 +1,4 @@
-"""Point splatting to depth maps with a contributor index."""
+"""Point splatting to depth maps with the index of each pixel's point."""
 
 from types import SimpleNamespace
 
@@ -9,10 +9,10 @@ EMPTY = 0x7F800000_FFFFFFFF  # the key of an empty pixel: the bits of +inf, then
 
 
 def build(real):
-    # A float32 depth and its point fit one 64-bit key: the bits of positive floats are in their order, so the smallest
-    # key is the nearest depth, then the lowest index. The map of indices holds the keys until they are decoded.
+    # A float32 depth and a point index form one 64-bit key: the bits of positive floats sort like their values, so the
+    # smallest key is the nearest depth, then the lowest index. The index map holds the keys until they are decoded.
     packed = real == ti.f32
-    # The camera in registers, clouds as flat arrays: indexing in three dimensions would cost more than the arithmetic.
+    # The camera in registers, clouds as flat arrays: indexing in three dimensions takes longer than the arithmetic.
     reals = ti.types.ndarray(dtype=real, ndim=1)
     integers = ti.types.ndarray(dtype=ti.i64, ndim=1)
     flags = ti.types.ndarray(dtype=ti.u8, ndim=1)
@@ -32,7 +32,7 @@ def build(real):
 
     @ti.func
     def fill(values: ti.template(), start, stop, value):
-        """Sixteen at a time, because a loop between two computed bounds is not packed."""
+        """Sixteen at a time, because a loop between two computed bounds is not vectorised."""
         blocks = (stop - start) // 16
         for block in range(blocks):
             for s in ti.static(range(16)):
@@ -44,10 +44,10 @@ def build(real):
     def cover_one(
         depth: ti.template(), index: ti.template(), visible: ti.template(), start, i, u, v, d, size
     ):
-        """Point `i` competes for its pixel of the map at start[0]; visible, at start[1], follows who owns it."""
+        """Point `i` takes its pixel of the map at start[0] if it is nearer; `visible` begins at start[1]."""
         if (d > real(0.0)) & (u >= real(0.0)) & (u < size[1]) & (v >= real(0.0)) & (v < size[0]):
             p = start[0] + ti.cast(v, ti.i32) * ti.cast(size[1], ti.i32) + ti.cast(u, ti.i32)
-            # Selects instead of branches: whether a point wins cannot be foreseen, and a missed branch costs more.
+            # Selects instead of branches, which would be unpredictable and therefore slower.
             owner = ti.cast(index[p], ti.i32)
             before = depth[p]
             wins = d < before
@@ -66,9 +66,9 @@ def build(real):
 
     @ti.func
     def offer(depth: ti.template(), index: ti.template(), p, i, d):
-        """Point `i` of depth `d` competes for pixel `p`; of depth NaN, in vain.
+        """Point `i` of depth `d` takes pixel `p` if it is nearer; never with depth NaN.
 
-        By selects: nobody could foresee a branch.
+        By selects, because a branch would be unpredictable.
         """
         if ti.static(packed):
             key = (ti.cast(ti.bit_cast(d, ti.i32), ti.i64) << 32) | ti.cast(i, ti.i64)
@@ -99,19 +99,19 @@ def build(real):
 
     @ti.func
     def within(x, low, high):
-        """Cut to [low, high], NaN to low: two instructions, as long as the comparisons stay in this form."""
+        """Clamp to [low, high], NaN to low; in this form it compiles to two instructions."""
         above = ti.select(x > low, x, low)
         return ti.select(above < high, above, high)
 
     @ti.func
     def floor_of(x):
-        """Of what fits an integer; a call of ti.floor would cost ten times as much."""
+        """Floor of a value in the range of int32; ti.floor takes ten times as long."""
         cut = ti.cast(x, ti.i32)
         return ti.select(ti.cast(cut, real) > x, cut - 1, cut)
 
     @ti.func
     def cover_disc(depth: ti.template(), index: ti.template(), start, i, u, v, d, size, radius):
-        """Point `i` competes for its own pixel and for those whose centre lies within `radius` pixels of it."""
+        """Point `i` takes its own pixel and those whose centre lies within `radius` pixels, where it is nearer."""
         half = real(0.5)
         margin = radius + real(1.0)
         if (d > real(0.0)) & (u > -margin) & (u < size[1] + margin) & (v > -margin) & (v < size[0] + margin):
@@ -143,18 +143,18 @@ def build(real):
     ):
         """`cover_disc` of a tile of points, of which `i` is the first, for a radius of at most 1.
 
-        Only the four pixels whose centres are nearest come into question, so there is no loop and no branch. A pixel
-        outside the map is replaced by its neighbour inside, for which the point then competes in vain.
+        Only the four pixels with the nearest centres can be covered, so there is no loop and no branch. A pixel outside
+        the map is replaced by its neighbour inside, with a depth that never wins.
 
         Returns:
-            Whether a point lies so near to the middle of its pixel that it may reach both sides: more than these four.
+            Whether a point is so near to its pixel's centre that it may cover more than these four.
         """
         zero = real(0.0)
         half = real(0.5)
         one = real(1.0)
         nan = real(ti.math.nan)
-        # Of the four pixels the lower right one, whose neighbours have the numbers before; as floats, which the
-        # processor handles four at a time with more kinds of instructions than integers.
+        # The lower right one of the four pixels; the others are its left and upper neighbours. As floats, for which
+        # more vector instructions exist than for integers.
         right = ti.cast(ti.cast(within(u + half, zero, size[1]), ti.i32), real)
         bottom = ti.cast(ti.cast(within(v + half, zero, size[0]), ti.i32), real)
         du0 = right - half - u
@@ -193,7 +193,7 @@ def build(real):
 
     @ti.func
     def mark_owners(index: ti.template(), visible: ti.template(), start, pixels):
-        """Without a branch: an empty pixel marks point 0, whose own flag is put right afterwards."""
+        """Without a branch: an empty pixel sets the flag of point 0, which is corrected afterwards."""
         owned = ti.u8(0)
         for p in range(start[0], start[0] + pixels):
             owner = ti.cast(index[p], ti.i32)
@@ -202,7 +202,7 @@ def build(real):
         visible[start[1]] = owned
 
     def make_forward(disc, serial):
-        """The splat of single pixels or of discs; on all threads, or without waking them for a small cloud."""
+        """The splat of single pixels or of discs; on all threads, or on one for small clouds."""
 
         @ti.kernel
         def forward(
@@ -221,9 +221,9 @@ def build(real):
             radius: real,
             spread: ti.i32,
         ):
-            """One thread owns one map; the nearest depth wins, then the lowest index.
+            """One thread per map; the nearest depth is kept, then the lowest index.
 
-            The points of a view may be shared out among `parts` maps, which `merge` then brings together. `total`
+            The points of a view may be divided among `parts` maps, which `merge` then combines. `total`
             receives the sum of the depths of each map's points: it is NaN or infinite if one of their coordinates is.
             """
             ti.loop_config(serialize=serial)
@@ -295,7 +295,7 @@ def build(real):
         pixels: ti.i32,
         spread: ti.i32,
     ):
-        """Maps of the parts of a cloud into one: parts are in the order of the points, so the first of equals wins."""
+        """Combines the maps of parts of a cloud; parts are in the order of points, so the first of a tie is kept."""
         for step in range(depth.shape[0] // pixels * spread):
             if step % spread == 0:
                 view = step // spread
@@ -325,7 +325,7 @@ def build(real):
         pixels: ti.i32,
         spread: ti.i32,
     ):
-        """depth = projection[2] @ (point, 1). One thread owns one cloud and all its views, so no addition is atomic."""
+        """depth = projection[2] @ (point, 1). One thread per cloud handles all its views, so no addition is atomic."""
         for step in range(points.shape[0] // (3 * count) * spread):
             if step % spread == 0:
                 cloud = step // spread

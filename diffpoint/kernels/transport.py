@@ -1,12 +1,12 @@
-"""Assignment by auction: persons bid for objects at rising prices, with a falling bid increment (epsilon).
+"""Assignment by auction: persons bid for objects at rising prices, with a decreasing bid increment (epsilon).
 
 Bertsekas' Gauss-Seidel auction with epsilon scaling, one pair of clouds per thread. Where there are fewer persons
-than objects, dummy persons to whom every object is free make up the number: the problem becomes symmetric, and with
-it the certificate below holds.
+than objects, dummy persons with distance 0 to every object are added: the problem becomes symmetric, and the bound
+below holds.
 
 After each phase the duality gap is measured. For any prices p,
-    sum_i min_j (c_ij + p_j) - sum_j p_j  <=  cost of the best assignment,
-so the cost minus this bound says how far from the best the assignment can be; the auction ends when that is little.
+    sum_i min_j (c_ij + p_j) - sum_j p_j  <=  cost of the optimal assignment,
+so the cost is at most its difference from this bound above the optimum; the auction stops when that is small enough.
 """
 
 from types import SimpleNamespace
@@ -16,7 +16,9 @@ from diffpoint.kernels._backend import ti
 LANES = 16
 SCALING = 5.0  # epsilon's factor between phases
 COARSEST = 0.1  # first epsilon, relative to the extent of the pair
-ENOUGH = 1.5  # epsilon over the mean gap that it leaves, at most: it leaves 0.4 to 0.6 of itself
+ENOUGH = (
+    1.5  # smallest epsilon, relative to the accepted gap: a phase leaves a mean gap of 0.4 to 0.6 epsilon
+)
 
 
 def build(real):
@@ -48,7 +50,7 @@ def build(real):
         first = ti.Vector([real(far) for s in ti.static(range(LANES))])
         second = ti.Vector([real(far) for s in ti.static(range(LANES))])
         first_tile = ti.Vector([0 for s in ti.static(range(LANES))])
-        # The array's own size as the bound: with a computed one the compiler gives up on packing (5x slower).
+        # The array's own size as the bound: with a computed one the loop is not vectorised (5x slower).
         for t in range(x_lanes.shape[1]):
             dx = x_lanes[pair, t] - x
             dy = y_lanes[pair, t] - y
@@ -95,11 +97,11 @@ def build(real):
         bids_per_person: ti.i32,
         spread: ti.i32,
     ):
-        """`price` and `price_lanes` are the same memory: prices to start from and, at the end, those arrived at.
+        """`price` and `price_lanes` are the same memory: first the prices to start from, at the end the final ones.
 
-        start_cost: about what the mean cost will be, where the prices are those of a pair like this one; negative
-        where nothing is known and all prices are 0. enough: where the best mean cost is proven to be at least this,
-        the auction ends. bound: what the mean cost can be above the best one.
+        start_cost: the mean cost of the pair that the prices to start from belong to; negative if all prices are 0.
+        enough: the auction stops once the lower bound of the optimal mean cost reaches this. bound: upper bound of the
+        mean cost minus the optimum.
         """
         for step in range(persons.shape[0] * spread):
             if step % spread == 0:
@@ -131,8 +133,8 @@ def build(real):
                         )
                         proven += ti.cast(cheapest, ti.f64) - ti.cast(price[pair, i], ti.f64)
                 if start_cost[pair] >= 0:
-                    # What the prices prove of this pair says how far they are from its own, and so where to begin. The
-                    # cost is at least that; how far it is from the cost before, the pair has moved.
+                    # The lower bound from the start prices tells how well they fit this pair, and so the first epsilon:
+                    # the difference between the earlier cost and the bound is about how far the pair has moved.
                     least = ti.cast(proven / n, real)
                     known = ti.max(start_cost[pair], least)
                     moved = ti.max(start_cost[pair] - least, least - start_cost[pair])
@@ -153,7 +155,7 @@ def build(real):
                     person_of[pair, i] = -1
                     queue[pair, i] = i
                 if proven >= proof_wanted:
-                    # Before a single bid (prices of 0 prove the distance to the nearest object): anybody takes any.
+                    # The start prices are enough (prices of 0 give the distance to the nearest object): any assignment.
                     running = False
                     cost = ti.cast(0.0, ti.f64)
                     for i in range(m):
@@ -184,7 +186,7 @@ def build(real):
                             persons[pair, row, 2],
                             weight,
                         )
-                        # A single object has no second: its price needs no competition.
+                        # A single object has no second best offer, so its price rises by epsilon only.
                         rise = ti.select(m > 1, next_best - best, real(0.0)) + epsilon
                         price[pair, j] = price[pair, j] + rise  # not +=, which would be an atomic addition
                         outbid = person_of[pair, j]
@@ -198,7 +200,7 @@ def build(real):
                             waiting += 1
                         bids += 1
                     if waiting > 0:
-                        # Out of bids: whoever still waits takes a free object, in order.
+                        # No bids left: unassigned persons take free objects in order.
                         free = 0
                         for i in range(m):
                             if object_of[pair, i] < 0:
@@ -232,7 +234,7 @@ def build(real):
                             weight,
                         )
                         lower_bound += ti.cast(cheapest, ti.f64) - ti.cast(price[pair, i], ti.f64)
-                        # Who is within the next epsilon of the best offer keeps the object; the others bid again.
+                        # A person within the next epsilon of the best offer keeps the object; the others bid again.
                         if distance + price[pair, j] > cheapest + finer:
                             queue[pair, dissatisfied] = i
                             dissatisfied += 1
@@ -243,7 +245,7 @@ def build(real):
                     if good or finished[pair] == 0:
                         running = False
                     elif epsilon <= smallest_epsilon:
-                        # As fine as the number format resolves; what remains is rounding, unless it is not small.
+                        # The resolution of the dtype is reached; the remaining gap is rounding unless it is large.
                         if gap / n > 10.0 * ti.cast(smallest_epsilon, ti.f64):
                             finished[pair] = ti.u8(0)
                         running = False

@@ -1,4 +1,4 @@
-"""The compaction of the points each view sees."""
+"""Gathers the points that each view sees, and scatters their gradients."""
 
 from types import SimpleNamespace
 
@@ -19,7 +19,7 @@ def build(real):
         views: ti.i32,
         spread: ti.i32,
     ):
-        """Visible points moved to the front of each view's row, in their own order; zeros and -1 behind."""
+        """Visible points moved to the front of each view's row, in their own order; zeros and -1 after them."""
         for step in range(visible.shape[0] * spread):
             if step % spread == 0:
                 view = step // spread

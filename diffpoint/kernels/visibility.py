@@ -1,7 +1,7 @@
 """Visibility of points without a mesh, from the horizons of the points themselves.
 
 Image positions are (u, v, w): pixels, and w = focal length * log(depth), so that differences of all three are lengths
-in one unit, the pixel, wherever the object stands. w is +inf for points that are not in the frame.
+in pixels, at any distance of the object. w is +inf for points that are not in the frame.
 """
 
 from types import SimpleNamespace
@@ -9,11 +9,11 @@ from types import SimpleNamespace
 from diffpoint.kernels._backend import ti
 
 FILTERS = 8
-"""Filters of the horizon test; each reads the 8 sectors from each of them in turn."""
+"""Number of filters of the horizon test; each is applied at the 8 rotations of the sectors."""
 CELL, DEEP = 2.5, 1.5
 """Cells have this side, in spacings of the points; a point is enclosed if on two of the four lines through its cell the
 cells on both sides are this much nearer."""
-_LANES = 16  # points judged at once in the horizon test: one vector register
+_LANES = 16  # points scored at once in the horizon test: one vector register
 
 
 def build(real):
@@ -36,12 +36,12 @@ def build(real):
         height,
         width,
     ):
-        """Fill `image`; returns focal lengths' ratio, spacing, low u, low v, extents of u and v, how many points."""
+        """Fill `image`; returns ratio of focal lengths, spacing, low u, low v, extents of u and v, number of points."""
         camera = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
         across = ti.Vector([camera[0], camera[1], camera[2]])
         down = ti.Vector([camera[4], camera[5], camera[6]])
         forward = ti.Vector([camera[8], camera[9], camera[10]])
-        # K's skew and principal point lie along `forward`, so the products leave the focal lengths.
+        # K's skew and principal point are parts along `forward`, which the cross products remove.
         focal = across.cross(forward).norm()
         aspect = focal / down.cross(forward).norm()
         columns = ti.cast(width, real)
@@ -72,7 +72,7 @@ def build(real):
         extent_v = (high_v - low_v) * aspect
         spacing = real(1.0)
         if inside > 0:
-            # Points thrown on a silhouette of A cells occupy A (1 - exp(-n / A)) of them: solved for A.
+            # n random points on a silhouette of A cells occupy A (1 - exp(-n / A)) of them: solved for A.
             n = ti.cast(inside, real)
             side = cell_side(extent_u, extent_v, n / real(2.0), n, real(1e-6))
             per_side = real(1.0) / side
@@ -98,7 +98,7 @@ def build(real):
 
     @ti.func
     def cell_side(extent_u, extent_v, cells, longest, smallest):
-        """Side of the square cells that cut the extents into about `cells`, and neither into more than `longest`."""
+        """Side of square cells of which about `cells` cover the extents, and at most `longest` per direction."""
         even = ti.sqrt(extent_u * extent_v / cells)
         thin = ti.max(extent_u, extent_v) / longest
         return ti.max(even, thin, smallest)
@@ -132,7 +132,7 @@ def build(real):
     ):
         """Counting sort, cell by cell, of the points that are not enclosed (see `DEEP`).
 
-        `packed` and `order` then hold them and their indices, `ends` where each cell's end; returns how many they are.
+        `packed` and `order` then hold the points and their indices, `ends` the end of each cell; returns their number.
         """
         first = slot * (8 * count + 32)
         for c in range(first, first + across * down):
@@ -161,7 +161,7 @@ def build(real):
                 )
                 enclosed = w > level + deep
                 ends[c] = ends[c] + ti.select(enclosed, 0, 1)  # not +=, which would be atomic
-                # The spare place at the end takes the enclosed points: cheaper than a branch nobody can predict.
+                # Enclosed points go to the spare place at the end: faster than an unpredictable branch.
                 cell[i] = ti.select(enclosed, -1, c)
             else:
                 cell[i] = -1
@@ -182,7 +182,7 @@ def build(real):
             packed[slot * stride * 3 + target] = image[at] - low_u
             packed[slot * stride * 3 + stride + target] = (image[at + 1] - low_v) * aspect
             packed[slot * stride * 3 + stride * 2 + target] = image[at + 2]
-        for k in range(3):  # the last register is filled up with the last point
+        for k in range(3):  # the last register is padded with the last point
             for rest in range(total, ti.select(total > 0, total + _LANES, total)):
                 at = (slot * 3 + k) * stride
                 packed[at + rest] = packed[at + total - 1]
@@ -265,7 +265,7 @@ def build(real):
                         x = ti.Vector([packed[xs + begin + s] for s in ti.static(range(_LANES))])
                         y = ti.Vector([packed[ys + begin + s] for s in ti.static(range(_LANES))])
                         w = ti.Vector([packed[ws + begin + s] for s in ti.static(range(_LANES))])
-                        # Eight vectors by name: a matrix would not stay in registers.
+                        # Eight variables, because a matrix would not stay in registers.
                         none = ti.Vector([real(-1.0) for _ in ti.static(range(_LANES))])
                         c0, c1, c2, c3, c4, c5, c6, c7 = none, none, none, none, none, none, none, none
                         left = ti.max(ti.cast((x.min() - reach) * per_side, ti.i32) + 1, 1)
@@ -273,19 +273,19 @@ def build(real):
                         top = ti.max(ti.cast((y.min() - reach) * per_side, ti.i32) + 1, 1)
                         bottom = ti.min(ti.cast((y.max() + reach) * per_side, ti.i32) + 1, down - 2)
                         for row in range(top, bottom + 1):
-                            # A row of cells is one run of points; a cell begins where the one before it ends.
+                            # The points of a row of cells are contiguous; a cell begins where the one before it ends.
                             start = cells[first + row * across + left - 1]
                             for j in range(start, cells[first + row * across + right]):
                                 dx = packed[xs + j] - x
                                 dy = packed[ys + j] - y
                                 gap = w - packed[ws + j]
                                 d = dx * dx + dy * dy
-                                # Squared cosine between the view's axis and the way to the neighbour, signed; with
-                                # `tiny` it is -1, no horizon, for the point itself.
+                                # Signed squared cosine between the view's axis and the direction to the neighbour; with
+                                # `tiny` it is -1 (no horizon) for the point itself.
                                 tiny = real(1e-30)
                                 rise = (gap * ti.abs(gap) - tiny) / (d + gap * gap + tiny)
                                 rise = ti.select(d <= reach * reach, rise, real(-1.0))
-                                # One sector takes the height, the others nothing.
+                                # The height counts in one sector only.
                                 steep, left_of, above = ti.abs(dy) > ti.abs(dx), dx < 0, dy < 0
                                 steep_any, flat_any = (
                                     ti.select(steep, rise, none),
@@ -307,15 +307,15 @@ def build(real):
                                 c5 = higher(ti.select(above, steep_left, none), c5)
                                 c6 = higher(ti.select(above, steep_right, none), c6)
                                 c7 = higher(ti.select(above, flat_right, none), c7)
-                        score = judge(filters, c0, c1, c2, c3, c4, c5, c6, c7)
+                        score = score_of(filters, c0, c1, c2, c3, c4, c5, c6, c7)
                         for s in ti.static(range(_LANES)):
                             if begin + s < remaining:
                                 i = order[slot * stride + begin + s]
                                 visible[view * count + i] = ti.cast(score[s] <= limit, ti.u8)
 
     @ti.func
-    def judge(filters: ti.template(), c0, c1, c2, c3, c4, c5, c6, c7):
-        """Filters of 8 weights, a bias, and what their mean and their maximum over the 8 rotations count."""
+    def score_of(filters: ti.template(), c0, c1, c2, c3, c4, c5, c6, c7):
+        """Score of filters: 8 weights, a bias, and the weights of mean and maximum over the 8 rotations."""
         h0, h1, h2, h3 = signed_root(c0), signed_root(c1), signed_root(c2), signed_root(c3)
         h4, h5, h6, h7 = signed_root(c4), signed_root(c5), signed_root(c6), signed_root(c7)
         score = h0 * real(0.0)

@@ -1,1 +1,1 @@
-"""What `test_properties.py` throws at the ops, and how it judges what comes back."""
+"""Inputs and checks of `test_properties.py`."""

@@ -1,4 +1,4 @@
-"""Nearest neighbours, chamfer, earth mover's distance, soft matching and farthest points against their twins."""
+"""Nearest neighbours, chamfer, earth mover's distance, soft matching, farthest points: against the reference."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from torch import Tensor
 import diffpoint as dp
 from diffpoint import reference
 from diffpoint.transport import _RESOLUTION
-from properties import strategies as throw
-from properties.judge import (
+from properties import strategies
+from properties.compare import (
     AGREED,
     REFUSED,
     assert_finite_gradients,
@@ -21,7 +21,7 @@ from properties.judge import (
 )
 
 
-def check_nearest(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
+def check_nearest(recipes: tuple[strategies.Recipe, strategies.Recipe]) -> str:
     a, b = (r.make() for r in recipes)
     lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
     result = refuse_or_run(
@@ -40,20 +40,20 @@ def check_nearest(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
         chosen = torch.take_along_dim(y, result.index.clamp(min=0)[..., None], -2)
         attained = (x - chosen).double().square().sum(-1)
         assert_within(attained[real], squared[real].double(), 16 * eps(x.dtype) * squared[real])
-        twins = (chosen[..., :, None, :] == y[..., None, :, :]).all(-1)
-        assert torch.equal(twins.to(torch.uint8).argmax(-1)[real], result.index[real]), "the lowest of equals"
+        equal = (chosen[..., :, None, :] == y[..., None, :, :]).all(-1)
+        assert torch.equal(equal.to(torch.uint8).argmax(-1)[real], result.index[real]), "the lowest of equals"
         gradient, _ = assert_finite_gradients(result.squared_distance, a.points, b.points)
         expected = torch.where(real[..., None], 2 * (x - chosen), 0.0)
         assert_within(gradient, expected, 8 * eps(x.dtype) * expected.abs())
     return AGREED
 
 
-def _empty(*clouds: throw.Cloud) -> bool:
-    """Has one of them a set without points?"""
+def _empty(*clouds: strategies.Cloud) -> bool:
+    """Whether one of them has a set without points."""
     return any(c.points.shape[-2] == 0 or bool((c.counts == 0).any()) for c in clouds)
 
 
-def check_chamfer_distance(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
+def check_chamfer_distance(recipes: tuple[strategies.Recipe, strategies.Recipe]) -> str:
     a, b = (r.make() for r in recipes)
     lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
     refuse = a.poisoned or b.poisoned or _empty(a, b)
@@ -72,7 +72,7 @@ def check_chamfer_distance(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
     return AGREED
 
 
-def check_earth_mover_distance(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
+def check_earth_mover_distance(recipes: tuple[strategies.Recipe, strategies.Recipe]) -> str:
     a, b = (r.make() for r in recipes)
     lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
     result = refuse_or_run(
@@ -97,7 +97,7 @@ def check_earth_mover_distance(recipes: tuple[throw.Recipe, throw.Recipe]) -> st
         assert_within(cost[i], (p[matched] - q[partners]).norm(dim=-1).mean(), slack)
         excess = float(cost[i]) - _least_mean_cost(p, q)
         assert -slack <= excess <= float(bound[i]) + slack
-        # Converged is also what the number format no longer resolves: a cost of 0 has no 2 %.
+        # The resolution of the dtype also counts as converged: for a cost of 0 no tolerance of 2 % can be reached.
         both = torch.cat((p, q))
         resolved = 10 * _RESOLUTION[p.dtype] * float((both.amax(0) - both.amin(0)).norm())
         assert not converged[i] or bound[i] <= max(0.02 * cost[i], resolved) + slack
@@ -105,14 +105,14 @@ def check_earth_mover_distance(recipes: tuple[throw.Recipe, throw.Recipe]) -> st
 
 
 def _least_mean_cost(p: Tensor, q: Tensor) -> float:
-    """By the twin; by scipy where the twin would take seconds."""
+    """By the reference; by scipy where that would take seconds."""
     if len(p) * len(q) <= 400:
         return float(reference.earth_mover_distance(p.double(), q.double())[0])
     matrix = reference.pairwise_squared_distance(p.double(), q.double()).sqrt().numpy()
     return float(matrix[linear_sum_assignment(matrix)].mean())
 
 
-def check_approxmatch(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
+def check_approxmatch(recipes: tuple[strategies.Recipe, strategies.Recipe]) -> str:
     a, b = (r.make() for r in recipes)
     lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
     result = refuse_or_run(
@@ -131,7 +131,7 @@ def check_approxmatch(recipes: tuple[throw.Recipe, throw.Recipe]) -> str:
     return AGREED
 
 
-def check_farthest_point_sample(recipe: throw.Recipe, k: int, start: int) -> str:
+def check_farthest_point_sample(recipe: strategies.Recipe, k: int, start: int) -> str:
     cloud = recipe.make()
     smallest = int(cloud.counts.min()) if cloud.counts.numel() else 0
     refuse = cloud.counts.numel() > 0 and (cloud.poisoned or k > smallest or start > max(smallest - 1, 0))

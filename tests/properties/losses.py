@@ -1,4 +1,4 @@
-"""The paper's losses against their twins."""
+"""The paper's losses against the reference implementations."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import torch
 
 import diffpoint as dp
 from diffpoint import reference
-from properties import strategies as throw
-from properties.judge import (
+from properties import strategies
+from properties.compare import (
     AGREED,
-    BANDED,
     REFUSED,
+    UNDECIDED,
     assert_finite_gradients,
     assert_within,
     eps,
     magnitude,
     refuse_or_run,
 )
-from properties.rendering import Maps, decided_pixels, image_bounds, twins_camera
+from properties.rendering import Maps, camera_matrices, decided_pixels, image_bounds
 
 
-def same_picture(cloud: throw.Cloud, camera: dp.PinholeCamera) -> bool:
-    """Do the op and its twin certainly see the same points? Then the losses on top of them can be compared."""
-    matrices = twins_camera(camera, len(cloud.points))
+def same_picture(cloud: strategies.Cloud, camera: dp.PinholeCamera) -> bool:
+    """Whether op and reference certainly see the same points, so that losses based on them can be compared."""
+    matrices = camera_matrices(camera, len(cloud.points))
     at = image_bounds(cloud.clean, *matrices)
     if not bool(decided_pixels(at, camera, 0.0, cloud.counts).all()):
         return False
@@ -35,7 +35,7 @@ def same_picture(cloud: throw.Cloud, camera: dp.PinholeCamera) -> bool:
     )
 
 
-def view_loss(case: Maps, name: str, twin: Callable, **options) -> str:
+def view_loss(case: Maps, name: str, function: Callable, **options) -> str:
     cloud, camera, depth, poisoned = case.make()
     loss_of = getattr(dp, name)
     nothing = len(depth) == 0 or case.views == 0
@@ -59,14 +59,14 @@ def view_loss(case: Maps, name: str, twin: Callable, **options) -> str:
     assert_finite_gradients(loss, cloud.points, depth)
     larger = options.get("upsample", 1)
     if not same_picture(cloud, camera.resize(camera.height * larger, camera.width * larger)):
-        return BANDED
-    matrices = [m.expand(*depth.shape[:2], *m.shape[-2:]) for m in twins_camera(camera, len(depth))]
+        return UNDECIDED
+    matrices = [m.expand(*depth.shape[:2], *m.shape[-2:]) for m in camera_matrices(camera, len(depth))]
     if loss.numel():
-        expected = twin(cloud.clean, *matrices, depth.detach(), **options)
+        expected = function(cloud.clean, *matrices, depth.detach(), **options)
         foreground = depth.detach()[torch.isfinite(depth)]
         size = magnitude(cloud.clean, foreground) + 10
         slack = 500 * eps(loss.dtype) * size
-        # The twin's assignment is exact; the op's costs at most its tolerance more.
+        # The reference assignment is exact; that of the op is within its tolerance.
         above = 0.021 * expected if options.get("distance") == "emd" else 0.0
         assert bool(((loss >= expected - slack) & (loss <= expected + above + slack)).all())
     return AGREED
@@ -76,7 +76,9 @@ def check_front_constraint(case: Maps, distance: str) -> str:
     return view_loss(case, "front_constraint", reference.front_constraint, distance=distance)
 
 
-def check_diversity_loss(recipe: throw.Recipe, dimension: int, alpha: float, poison: float | None) -> str:
+def check_diversity_loss(
+    recipe: strategies.Recipe, dimension: int, alpha: float, poison: float | None
+) -> str:
     cloud = recipe.make()
     codes = torch.randn(*recipe.batch, dimension, generator=torch.Generator().manual_seed(recipe.seed))
     codes = codes.to(recipe.dtype)
@@ -97,12 +99,12 @@ def check_diversity_loss(recipe: throw.Recipe, dimension: int, alpha: float, poi
     assert_finite_gradients(loss, codes, cloud.points)
     expected = reference.diversity_loss(codes.detach(), cloud.clean, alpha=alpha).mean()
     slack = 1e3 * eps(recipe.dtype) * (alpha * magnitude(cloud.clean) + 10)
-    below = 0.06 * alpha * 2 * magnitude(cloud.clean)  # the op's transport costs at most its tolerance more
+    below = 0.06 * alpha * 2 * magnitude(cloud.clean)  # the assignment of the op is within its tolerance
     assert expected - below - slack <= loss <= expected + slack
     return AGREED
 
 
-def check_consistency_loss(recipe: throw.Recipe) -> str:
+def check_consistency_loss(recipe: strategies.Recipe) -> str:
     cloud = recipe.make()
     refuse = cloud.poisoned or recipe.batch[-1] < 2 or recipe.count == 0 or 0 in recipe.batch
     loss = refuse_or_run(

@@ -1,4 +1,4 @@
-"""The projection losses and the soft splat against their twins."""
+"""The projection losses and the soft splat against the reference implementations."""
 
 from __future__ import annotations
 
@@ -6,24 +6,36 @@ import torch
 from torch import Tensor
 
 import diffpoint as dp
-from diffpoint import reference_projection as twins
-from properties import strategies as throw
-from properties.judge import AGREED, BANDED, REFUSED, assert_finite_gradients, eps, magnitude, refuse_or_run
+from diffpoint import reference_projection
+from properties import strategies
+from properties.compare import (
+    AGREED,
+    REFUSED,
+    UNDECIDED,
+    assert_finite_gradients,
+    eps,
+    magnitude,
+    refuse_or_run,
+)
 from properties.losses import view_loss
-from properties.rendering import Maps, Rendering, image_bounds, twins_camera
+from properties.rendering import Maps, Rendering, camera_matrices, image_bounds
 
 
 def check_projection_loss(case: Maps, upsample: int, mask_weight: float) -> str:
     return view_loss(
-        case, "projection_loss", twins.projection_loss, upsample=upsample, mask_weight=mask_weight
+        case,
+        "projection_loss",
+        reference_projection.projection_loss,
+        upsample=upsample,
+        mask_weight=mask_weight,
     )
 
 
 def _footprints(
-    cloud: throw.Cloud, camera: dp.PinholeCamera, radius: float
+    cloud: strategies.Cloud, camera: dp.PinholeCamera, radius: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Footprint, its possible error, depth and its possible error (B, V, N, H, W), in float64."""
-    at = image_bounds(cloud.clean, *twins_camera(camera, len(cloud.points)))
+    at = image_bounds(cloud.clean, *camera_matrices(camera, len(cloud.points)))
     u, v, depth, du, dv, dd = (t[..., None, None] for t in at)
     across = torch.arange(camera.width, dtype=torch.float64)[None, :] + 0.5 - u
     down = torch.arange(camera.height, dtype=torch.float64)[:, None] + 0.5 - v
@@ -73,7 +85,7 @@ def check_soft_splat(case: Rendering, softness: float) -> str:
     widest = torch.where(footprint + error > 0, dz.expand_as(footprint), 0.0).amax(2)
     slack = 4 * loose * reach + 4 * widest + rounding * (depth.abs() + softness)
     assert bool(((soft.depth - depth).abs() <= slack)[certain].all())
-    return AGREED if bool((certain | (weight == 0)).all()) else BANDED
+    return AGREED if bool((certain | (weight == 0)).all()) else UNDECIDED
 
 
 def check_soft_projection_loss(case: Maps, mask_weight: float) -> str:
@@ -93,13 +105,15 @@ def check_soft_projection_loss(case: Maps, mask_weight: float) -> str:
     assert loss.shape == depth.shape[:2]
     assert torch.isfinite(loss).all()
     assert_finite_gradients(loss, cloud.points, depth)
-    at = image_bounds(cloud.clean, *twins_camera(camera, len(depth)))
+    at = image_bounds(cloud.clean, *camera_matrices(camera, len(depth)))
     worst = magnitude(at.u_error, at.v_error, at.depth_error / 0.05)
     if worst > 1e-6:
-        return BANDED
-    matrices = [m.expand(*depth.shape[:2], *m.shape[-2:]).double() for m in twins_camera(camera, len(depth))]
+        return UNDECIDED
+    matrices = [
+        m.expand(*depth.shape[:2], *m.shape[-2:]).double() for m in camera_matrices(camera, len(depth))
+    ]
     if loss.numel():
-        expected = twins.soft_projection_loss(
+        expected = reference_projection.soft_projection_loss(
             cloud.clean.double(), *matrices, depth.detach().double(), **options
         )
         foreground = depth.detach()[torch.isfinite(depth)]

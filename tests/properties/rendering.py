@@ -1,7 +1,7 @@
-"""Splatting, view sampling and projections against their twins.
+"""Splatting, view sampling and projections against the reference implementations.
 
-Where rounding may decide which pixel a point falls into, two correct renderers may disagree: `image_bounds` says how
-far a position can be off, and only pixels about which there is no doubt are compared.
+Where rounding decides which pixel a point falls into, two correct renderers may disagree: `image_bounds` bounds the
+error of positions, and only pixels that no such error changes are compared.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from torch import Tensor
 
 import diffpoint as dp
 from diffpoint import reference
-from properties import strategies as throw
-from properties.judge import (
+from properties import strategies
+from properties.compare import (
     AGREED,
-    BANDED,
     REFUSED,
+    UNDECIDED,
     assert_finite_gradients,
     assert_within,
     eps,
@@ -79,12 +79,12 @@ def decided_pixels(at: ImageBounds, camera: dp.PinholeCamera, radius: float, cou
 
 
 class Rendering(NamedTuple):
-    recipe: throw.Recipe
-    camera: throw.CameraRecipe
+    recipe: strategies.Recipe
+    camera: strategies.CameraRecipe
     radius: float = 0.0
 
 
-def twins_camera(camera: dp.PinholeCamera, batch: int) -> tuple[Tensor, Tensor]:
+def camera_matrices(camera: dp.PinholeCamera, batch: int) -> tuple[Tensor, Tensor]:
     """K and cam_from_world (B, V, ...)."""
     views = camera.batch_shape[-1] if camera.batch_shape else 1
     whole = camera.expand(batch, views)
@@ -101,7 +101,7 @@ def check_splat_depth(case: Rendering) -> str:
     if splat is None:
         return REFUSED
     size = camera.height, camera.width
-    matrices = twins_camera(camera, len(cloud.points))
+    matrices = camera_matrices(camera, len(cloud.points))
     assert_finite_gradients(splat.depth, cloud.points)
     depth, index, _ = reference.splat_depth(
         cloud.clean, *matrices, *size, radius=case.radius, lengths=cloud.lengths
@@ -117,7 +117,7 @@ def check_splat_depth(case: Rendering) -> str:
     assert torch.equal((splat.index >= 0)[decided], (index >= 0)[decided])
     hit = decided & (index >= 0)
     if not bool(hit.any()):
-        return AGREED if bool(decided.all()) else BANDED
+        return AGREED if bool(decided.all()) else UNDECIDED
 
     def of_winner(values: Tensor, winner: Tensor) -> Tensor:
         return torch.take_along_dim(values, winner.clamp(min=0).flatten(2), 2).view(winner.shape)[hit]
@@ -128,11 +128,11 @@ def check_splat_depth(case: Rendering) -> str:
     axes = cloud.clean[:, None].expand(-1, len(matrices[0][0]), -1, -1).unbind(-1)
     duplicate = torch.stack([of_winner(x, splat.index) == of_winner(x, index) for x in axes]).all(0)
     assert torch.equal(splat.index[hit][duplicate], index[hit][duplicate]), "the lowest of equals"
-    return AGREED if bool(decided.all()) else BANDED
+    return AGREED if bool(decided.all()) else UNDECIDED
 
 
 def check_sample_view(case: Rendering) -> str:
-    """The splat is made from sound points; the poison is in those that are sampled."""
+    """The splat is of finite points; invalid values are in the points that are sampled."""
     cloud, camera = case.recipe.make(), case.camera.make(case.recipe.dtype)
     sound = torch.nan_to_num(cloud.points.detach(), nan=0.0, posinf=0.0, neginf=0.0)
     splat = dp.splat_depth(sound, camera, radius=case.radius, lengths=cloud.lengths)
@@ -152,7 +152,7 @@ def check_project(case: Rendering) -> str:
     result = refuse_or_run(lambda: dp.project(cloud.points, camera), cloud.poisoned, "project")
     if result is None:
         return REFUSED
-    matrices = twins_camera(camera, len(cloud.points))
+    matrices = camera_matrices(camera, len(cloud.points))
     _assert_projected(result, reference.project(cloud.clean, *matrices), image_bounds(cloud.clean, *matrices))
     assert_finite_gradients(result.pixels, cloud.points)
     assert_finite_gradients(result.depth, cloud.points)
@@ -169,7 +169,7 @@ def _assert_projected(ours: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]
 
 
 def check_visible_points(case: Rendering, method: str) -> str:
-    """The methods are estimates, and their own tests judge those; here: what holds for each of them, for any cloud."""
+    """Properties that hold for every method and cloud; test_visibility.py tests how accurate the methods are."""
     cloud, camera = case.recipe.make(), case.camera.make(case.recipe.dtype)
 
     def visible() -> Tensor:
@@ -179,7 +179,7 @@ def check_visible_points(case: Rendering, method: str) -> str:
     seen = refuse_or_run(visible, cloud.poisoned, *names)
     if seen is None:
         return REFUSED
-    matrices = twins_camera(camera, len(cloud.points))
+    matrices = camera_matrices(camera, len(cloud.points))
     at = image_bounds(cloud.clean, *matrices)
     inside = torch.arange(case.recipe.count) < cloud.counts[:, None]
     assert seen.shape == at.depth.shape
@@ -194,13 +194,13 @@ def check_visible_points(case: Rendering, method: str) -> str:
 
 
 class Maps(NamedTuple):
-    recipe: throw.Recipe
-    camera: throw.CameraRecipe
-    target: throw.CameraRecipe
-    depth: throw.DepthRecipe
+    recipe: strategies.Recipe
+    camera: strategies.CameraRecipe
+    target: strategies.CameraRecipe
+    depth: strategies.DepthRecipe
     views: int
 
-    def make(self) -> tuple[throw.Cloud, dp.PinholeCamera, Tensor, bool]:
+    def make(self) -> tuple[strategies.Cloud, dp.PinholeCamera, Tensor, bool]:
         cloud, camera = self.recipe.make(), self.camera.make(self.recipe.dtype)
         shape = (*self.recipe.batch, self.views, camera.height, camera.width)
         return cloud, camera, *self.depth.make(shape, self.recipe.dtype)
@@ -217,7 +217,7 @@ def check_unproject(case: Maps) -> str:
     result = refuse_or_run(lambda: dp.unproject(depth, camera), poisoned, "unproject")
     if result is None:
         return REFUSED
-    points, lengths = reference.unproject(depth.detach(), *twins_camera(camera, len(depth)))
+    points, lengths = reference.unproject(depth.detach(), *camera_matrices(camera, len(depth)))
     assert torch.equal(result.lengths, lengths)
     assert_within(result.points, points, _unprojection_error(depth, camera))
     assert_finite_gradients(result.points, depth)
@@ -231,8 +231,8 @@ def check_reproject(case: Maps) -> str:
     if result is None:
         return REFUSED
     batch, views, height, width = depth.shape
-    matrices = [m.expand(batch, views, *m.shape[-2:]) for m in twins_camera(target, batch)]
-    sources = [m.expand(batch, views, *m.shape[-2:]) for m in twins_camera(source, batch)]
+    matrices = [m.expand(batch, views, *m.shape[-2:]) for m in camera_matrices(target, batch)]
+    sources = [m.expand(batch, views, *m.shape[-2:]) for m in camera_matrices(source, batch)]
     expected = reference.reproject(depth.detach(), sources, matrices, (target.height, target.width))
     error = _unprojection_error(depth, source)
     assert_within(result.points, expected[0], error)

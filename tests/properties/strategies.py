@@ -1,4 +1,4 @@
-"""What the property tests throw at the ops: awkward clouds, layouts, lengths and cameras, drawn by hypothesis.
+"""Inputs of the property tests: degenerate clouds, layouts, lengths and cameras, drawn by hypothesis.
 
 Hypothesis draws a small recipe (so that a failure prints as one line and shrinks); the tensors are made from it with
 a seeded generator.
@@ -24,16 +24,16 @@ LAYOUTS = ("plain", "batch last", "axes first", "every second", "expanded")
 
 
 class Cloud(NamedTuple):
-    """A batch of clouds, as an op gets it."""
+    """A batch of clouds as passed to an op."""
 
     points: Tensor
     lengths: Tensor | None
     poisoned: bool
-    """A point that counts is not finite."""
+    """A point outside the padding is not finite."""
 
     @property
     def clean(self) -> Tensor:
-        """For the twin: contiguous, and zeros in the padding."""
+        """For the reference: contiguous, and zeros in the padding."""
         points = self.points.detach().clone()
         if self.lengths is not None:
             padding = torch.arange(points.shape[-2]) >= self.lengths[..., None]
@@ -60,7 +60,7 @@ class Recipe:
     lengths: bool
     poison: float | None
     in_padding: bool
-    """Put the poison where no point counts, if there is such a place."""
+    """Put the invalid value into the padding, if there is any."""
     seed: int
 
     def make(self) -> Cloud:
@@ -201,7 +201,7 @@ def cameras(draw: st.DrawFn, batch: int, views: int | None = None) -> CameraReci
 
 @dataclass(frozen=True)
 class DepthRecipe:
-    """Depth maps (B, V, H, W): holes, magnitudes, and perhaps a pixel that is no depth."""
+    """Depth maps (B, V, H, W): holes, magnitudes, and perhaps an invalid pixel."""
 
     full: float
     """Share of the pixels that are foreground."""
@@ -210,7 +210,7 @@ class DepthRecipe:
     seed: int
 
     def make(self, shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, bool]:
-        """The maps, and whether one of them holds no depth."""
+        """The maps, and whether a pixel is invalid."""
         random = torch.Generator().manual_seed(self.seed)
         share = torch.rand(shape, generator=random, dtype=torch.float64)
         depth = 10 ** (12 * share - 6) if self.magnitudes else 1 + share

@@ -75,6 +75,7 @@ class Object(NamedTuple):
         camera: the image's.
         backs: (K, P, 3) samples of each of its shapes.
         again: (K, P, 3) other samples of the same.
+        limits: `apart` -> `near_distance`.
     """
 
     category: str
@@ -82,6 +83,7 @@ class Object(NamedTuple):
     camera: PinholeCamera
     backs: Tensor
     again: Tensor
+    limits: Mapping[float | None, float]
 
 
 def configs(study: Study) -> list[FitConfig]:
@@ -174,7 +176,8 @@ def make_object(hider: AmbiguousObject, size: int) -> Object:
         for _ in range(2)
     )
     image = torch.from_numpy(views.images[0]).permute(2, 0, 1).float() / 255
-    return Object(hider.category, image, camera[0].to(dtype=torch.float32), backs, again)
+    limits = {apart: near_distance(backs, again, apart=apart) for apart in (APART, None)}
+    return Object(hider.category, image, camera[0].to(dtype=torch.float32), backs, again, limits)
 
 
 def hidden_distances(clouds: Tensor, backs: Tensor, *, apart: float | None = APART) -> Tensor:
@@ -234,7 +237,7 @@ def _judge(obj: Object, clouds: Tensor, counts: Sequence[int]) -> dict[str, floa
     """For the first so many clouds "COUNT/NAME" of each of `_COLUMNS`, and "COUNT/nearest_whole"."""
     found: dict[str, float] = {}
     for suffix, apart in (("", APART), ("_whole", None)):
-        near = near_distance(obj.backs, obj.again, apart=apart)
+        near = obj.limits[apart]
         distances = hidden_distances(clouds, obj.backs, apart=apart)
         for count in counts:
             reached, none = reach(distances[:count], near)
@@ -352,7 +355,6 @@ def _figure(study: Study, hiders: Sequence[AmbiguousObject], size: int) -> Figur
     for row, hider in zip(panels, chosen, strict=True):
         obj = make_object(hider, size)
         clouds = predict(model, obj.image, _SHOWN_CODES, seed=0)
-        near = near_distance(obj.backs, obj.again)
         close = figures.narrowed(side, torch.cat([obj.backs.flatten(0, 1), clouds.flatten(0, 1)]))
         figures.draw_image(row[0], obj.image)
         figures.caption(row[0], hider.category)
@@ -363,7 +365,11 @@ def _figure(study: Study, hiders: Sequence[AmbiguousObject], size: int) -> Figur
         ):
             figures.draw_cloud(axes, cloud, close[0])
             least, which = distances.min(0)
-            words = f"back {int(which) + 1}" if least < near else f"none (back {int(which) + 1} is nearest)"
+            words = (
+                f"back {int(which) + 1}"
+                if least < obj.limits[APART]
+                else f"none (back {int(which) + 1} is nearest)"
+            )
             axes.text(0.5, 0.0, words, transform=axes.transAxes, fontsize=8, ha="center", color=figures.MUTED)
     backs, codes = (f"back {k + 1}" for k in range(kinds)), (f"code {k + 1}" for k in range(_SHOWN_CODES))
     figures.titles(panels, ["the front", *backs, *codes])

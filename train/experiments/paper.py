@@ -123,12 +123,7 @@ def _oracle(row: Row, study: Study, config: FitConfig) -> Metrics:
     return study.measure(config, ["oracle"], measure, stage=0)
 
 
-_OTHERS = (
-    ("PSGN", "psgn", 8),
-    ("Lin et al.", "lin", 8),
-    ("PTN", "ptn", 8),
-    ("3D-R2N2", "r2n2", 5),
-)
+_OTHERS = (("PSGN", "psgn", 8), ("Lin et al.", "lin", 8), ("PTN", "ptn", 8), ("3D-R2N2", "r2n2", 5))
 
 SINGLE_CATEGORY = Table(
     title="Which method reconstructs shapes of one category best from eight views?",
@@ -153,12 +148,7 @@ SINGLE_CATEGORY = Table(
         ),
         Row(name="ours, its training shapes, random codes", codes="random", split="train"),
         *(
-            Row(
-                name=f"{name}, oracle",
-                change=of_method(method),
-                source="truth",
-                measure=_oracle,
-            )
+            Row(name=f"{name}, oracle", change=of_method(method), source="truth", measure=_oracle)
             for name, method, _ in _OTHERS
         ),
     ),
@@ -225,10 +215,7 @@ CRITIC = Table(
         Row(name="without, after stage 1", change=without_critic, stage=1),
         Row(name="with, after stage 1", change=with_critic, stage=1),
     ),
-    claims=(
-        below("cd", "with (gamma 0.1)", "without"),
-        below("fps_cd", "with (gamma 0.1)", "without"),
-    ),
+    claims=(below("cd", "with (gamma 0.1)", "without"), below("fps_cd", "with (gamma 0.1)", "without")),
 )
 
 _S1, _S1_AGREED = "stage 1, random codes", "stage 1, agreed codes"

@@ -171,6 +171,12 @@ class Ours(Method):
     def check(self, config: FitConfig) -> None:
         if config.occupancy_logits and config.output_head == "latent":
             raise UserError("supervision lin needs points that may be deleted; leave --output-head at points")
+        for name, stage in zip(("stage1", "stage2"), config.stages, strict=True):
+            if stage.beta > 0 and stage.codes < 2:
+                raise UserError(
+                    f"the diversity loss compares two or more codes of an image; got --{name}.codes {stage.codes}: "
+                    f"raise it, or set --{name}.beta 0 or --deterministic"
+                )
 
     def new_state(self, config: FitConfig) -> TrainState:
         generator = self.build(config)

@@ -1,4 +1,4 @@
-"""How a result is judged: refused exactly when it must be, within the rounding of its number format, never NaN."""
+"""Comparisons: an error exactly when there must be one, else equal up to rounding, and never NaN."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
-AGREED, REFUSED, BANDED = "agreed with the twin", "refused", "finite; too near a pixel's border to compare"
+AGREED, REFUSED, UNDECIDED = (
+    "agreed with the reference",
+    "refused",
+    "finite; too near a pixel's border to compare",
+)
 
 
 def refuse_or_run(call: Callable, refuse: bool, *names: str):
-    """The call's result; None if it was refused, which it must be exactly if `refuse`."""
+    """The call's result, or None if it raised an error, which it must exactly if `refuse`."""
     if not refuse:
         return call()
     with pytest.raises((ValueError, TypeError), match=rf"^({'|'.join(names)}): '\w+' must"):
