@@ -14,14 +14,14 @@ from diffpoint import PinholeCamera, nearest, visible_points
 from models import Generator, Predictor
 from train.data import ShapeTree
 from train.data.batches import LoadedSplit
+from train.evaluation.examples import make_example, pick_shapes
 from train.evaluation.per_shape import concatenate, sample_predictions
-from train.evaluation.report import make_example, pick_shapes
 from train.experiments.frame import Experiment, Outcome
-from train.experiments.markdown import table_lines
 from train.experiments.statistics import claim, spreads, stacked, trainings
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
 from train.show import figures
+from train.show.tables import markdown_lines
 
 CODES = 6
 SHOWN_CODES, SHOWN_SHAPES = 5, 6
@@ -125,7 +125,7 @@ def markdown(result: Mapping[str, Any]) -> str:
         for name, row in {"all": result["all"], **result["categories"]}.items()
     ]
     columns = ["", "shapes", "front", "back", "back / front, by seed", "of the surface"]
-    return "\n".join([head, "", *table_lines(columns, rows), ""])
+    return "\n".join([head, "", *markdown_lines(columns, rows), ""])
 
 
 def _figure(study: Study) -> Figure:
