@@ -5,7 +5,6 @@ The bare ops are the same source files, loaded with another `register`; only the
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import sys
 import time
