@@ -57,22 +57,19 @@ def measure(*, quick: bool = False) -> Iterator[dict[str, Any]]:
 
 def _shares(training: Training, warm: int, steps: int) -> dict[str, Any]:
     """Median milliseconds of a step, and the shares of its parts."""
-    from train import objective
-
     for _ in range(warm):
         training.advance()
     milliseconds: list[float] = []
     parts: dict[str, list[float]] = {}
     rendering: list[float] = []
 
-    def timed(*arguments: Any) -> Any:
+    def front_sets(*arguments: Any, **options: Any) -> Any:
         start = time.perf_counter()
-        result = front_sets(*arguments)
+        result = dp.front_sets(*arguments, **options)
         rendering.append(time.perf_counter() - start)
         return result
 
-    front_sets = objective.front_sets
-    with mock.patch.object(objective, "front_sets", timed):
+    with _replaced(front_sets):
         for _ in range(steps):
             rendering.clear()
             training.laps.begin()
@@ -125,8 +122,6 @@ def on_reference(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator
     Args:
         assign: replaces the assignment of the reference, which takes a second a pair.
     """
-    from diffpoint import losses
-    from train import objective, step
 
     def visible_points(points: Tensor, camera: dp.PinholeCamera, **_: Any) -> Tensor:
         return reference.splat_depth(points, camera.K, camera.cam_from_world, camera.height, camera.width)[2]
@@ -150,10 +145,19 @@ def on_reference(assign: Callable[[Any], Tensor] = reference.assign) -> Iterator
         return dp.Transport(cost, assignment, torch.zeros_like(cost), converged, prices)
 
     replacements = [visible_points, sample_view, unproject, chamfer_distance, earth_mover_distance]
+    with mock.patch.object(reference, "assign", assign), _replaced(*replacements):
+        yield
+
+
+@contextlib.contextmanager
+def _replaced(*functions: Callable) -> Iterator[None]:
+    """Within, the losses use these functions instead of those of the same names."""
+    from diffpoint import losses
+    from train import objective, step
+
     with contextlib.ExitStack() as stack:
-        stack.enter_context(mock.patch.object(reference, "assign", assign))
         for module in (losses, objective, step):
-            for function in replacements:
+            for function in functions:
                 if hasattr(module, function.__name__):
                     stack.enter_context(mock.patch.object(module, function.__name__, function))
         yield
