@@ -51,7 +51,7 @@ def measure(*, quick: bool = False) -> Iterator[dict[str, Any]]:
             row = {"profile": profile, "stage": name[-1], **_shares(trainer, warm, 2 if quick else steps)}
             if profile in _WITH_REFERENCE:
                 with reference_ops():
-                    row["twins_ratio"] = 1e3 * _seconds(trainer.train_step) / row["ms"]
+                    row["reference_ratio"] = 1e3 * _seconds(trainer.train_step) / row["ms"]
                 if optimize := optional("scipy.optimize"):
                     solve = optimize.linear_sum_assignment
                     with reference_ops(lambda cost, solve=solve: torch.from_numpy(solve(cost)[1])):

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from diffpoint import consistency_loss
 from models import Predictor
@@ -35,6 +34,7 @@ from train.experiments.statistics import spreads, stacked
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
 from train.experiments.table import NAMES
+from train.processes import progress_bar
 from train.show import figures
 from train.show.tables import markdown_lines
 
@@ -98,7 +98,7 @@ def make(study: Study) -> Outcome:
     ]
     everything = [*itertools.chain(*of_settings.values()), *of_groups]
     study.measure_all(_measured, [(run, each) for each in everything])
-    bar = tqdm(everything, desc="settings", unit="measurement", disable=not study.progress)
+    bar = progress_bar(everything, title="settings", unit="measurement", progress=study.progress)
     found = {each: stacked([_measured(study, run, each)]) for each in bar}  # metric -> (1, draws of codes, M)
     values = {name: _joined([found[each] for each in every]) for name, every in of_settings.items()}
     groups = _joined([found[each] for each in of_groups])

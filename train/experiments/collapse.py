@@ -17,7 +17,6 @@ from typing import Any
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from models import Generator
 from models.parts import IMAGE_GAIN, IMAGE_MEAN
@@ -31,6 +30,7 @@ from train.experiments.paper import without_critic
 from train.experiments.study import Study, stage1_of
 from train.files import kept
 from train.methods import get_method, recipe
+from train.processes import progress_bar
 from train.show import figures
 from train.show.tables import markdown_lines
 from train.training.trainer import Trainer
@@ -90,8 +90,8 @@ def make(study: Study) -> Outcome:
     curves: dict[str, dict[str, list[Curve]]] = {}
     missing = [each for each in _trainings(study) if not _kept_at(study, *each).exists()]
     study.side_by_side(_curve, missing, title="trainings")
-    for root, name, seed in tqdm(
-        _trainings(study), desc="trainings", unit="training", disable=not study.progress
+    for root, name, seed in progress_bar(
+        _trainings(study), title="trainings", unit="training", progress=study.progress
     ):
         curves.setdefault(root.name, {}).setdefault(name, []).append(_curve(study, root, name, seed))
     result = {

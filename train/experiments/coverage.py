@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
-from tqdm import tqdm
 
 from diffpoint import PinholeCamera, nearest
 from models import Predictor
@@ -40,6 +39,7 @@ from train.experiments.statistics import (
 )
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, unchanged
+from train.processes import progress_bar
 from train.show import figures
 from train.show.tables import markdown_lines
 
@@ -114,7 +114,7 @@ def make(study: Study) -> Outcome:
 
     def objects() -> list[Object]:
         if not made:
-            bar = tqdm(hiders, desc="fronts and backs", unit="object", disable=not study.progress)
+            bar = progress_bar(hiders, title="fronts and backs", unit="object", progress=study.progress)
             made.extend(make_object(hider, size) for hider in bar)
         return made
 
@@ -265,7 +265,7 @@ def _measured(
 
     def measure() -> Metrics:
         model = study.network(config)
-        bar = tqdm(objects(), desc="predictions", unit="object", disable=not study.progress)
+        bar = progress_bar(objects(), title="predictions", unit="object", progress=study.progress)
         return _over_objects(
             [_judge(obj, predict(model, obj.image, max(codes), seed=config.seed), codes) for obj in bar]
         )

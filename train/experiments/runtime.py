@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from scipy.spatial import Delaunay
-from tqdm import tqdm
 
 from diffpoint import runtime_info, sample_view, splat_depth, visible_points
 from diffpoint.visibility import Method
@@ -28,6 +27,7 @@ from train.experiments.hidden_points import EPSILON, VIEWS, Scene, embedded_scen
 from train.experiments.statistics import claim, claim_lines
 from train.experiments.study import Study
 from train.files import kept
+from train.processes import progress_bar
 from train.show import figures
 from train.show.tables import markdown_lines
 
@@ -105,7 +105,7 @@ def medians(
 
 def _times(scenes: Sequence[Scene], count: int, rounds: tuple[int, int], *, progress: bool) -> dict[str, Any]:
     """Milliseconds of one cloud in one view: the median over shapes, and each."""
-    bar = tqdm(scenes, desc=f"times, {count} points", unit="shape", disable=not progress)
+    bar = progress_bar(scenes, title=f"times, {count} points", unit="shape", progress=progress)
     by_shape = [_times_of(scene, count, rounds) for scene in bar]
     each = {name: [milliseconds[name] for milliseconds in by_shape] for name in by_shape[0]}
     middle = {name: float(np.median(values)) for name, values in each.items()}

@@ -28,10 +28,10 @@ from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatena
 from train.evaluation.retrieval import medoid, nearest_by_image
 from train.evaluation.runs import best_weights, load_predictor, read_split
 from train.experiments import store
-from train.experiments.side_by_side import run_side_by_side
 from train.experiments.store import Metrics, NotMeasured
 from train.files import write_text
 from train.methods import get_method, recipe
+from train.processes import run_in_processes
 from train.training import TRAINING_VERSION
 from train.training.trainer import fit
 
@@ -363,7 +363,7 @@ class Study:
         if min(self.processes, len(calls)) < 2:
             return
         alone = dataclasses.replace(self, progress=False, processes=1, _splits={})
-        run_side_by_side(
+        run_in_processes(
             functools.partial(_call, function),
             [(alone, *call) for call in calls],
             processes=self.processes,

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from train.errors import UserError
 from train.experiments.frame import Experiment, Outcome
@@ -35,6 +34,7 @@ from train.experiments.front_vs_projection.shapes import (
 )
 from train.experiments.study import Study
 from train.files import kept
+from train.processes import progress_bar
 
 SETTINGS = tuple(Cameras(n) for n in (1, 2, 4, 8)) + tuple(Cameras(n, sphere=True) for n in (8, 24))
 RATES = (0.003, 0.01, 0.03)
@@ -131,7 +131,7 @@ def _tune(study: Study, settings: Sequence[Cameras], iterations: int) -> dict[st
     shape = embedded_shape("bench", seed=1)
     available = [cameras for cameras in _TUNED_ON if cameras in settings] or list(settings[:1])
     rates = {}
-    for name in tqdm(LOSSES, desc="step sizes", unit="loss", disable=not study.progress):
+    for name in progress_bar(LOSSES, title="step sizes", unit="loss", progress=study.progress):
         own = [cameras for cameras in available if takes_part(name, cameras)] or available[:1]
         errors = []
         for rate in RATES:
@@ -159,7 +159,7 @@ def _fit_all(
         if takes_part(loss, cameras)
     ]
     records = []
-    for shape, cell in tqdm(cells, desc="free clouds", unit="fit", disable=not study.progress):
+    for shape, cell in progress_bar(cells, title="free clouds", unit="fit", progress=study.progress):
         scene = shape.scene(cell.cameras, seed=cell.seed)
         if scene is not None:
             place = {**cell._asdict(), "cameras": cell.cameras.name}

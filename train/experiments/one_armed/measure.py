@@ -14,7 +14,6 @@ from typing import Any, get_args
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from train.config import FitConfig
 from train.data import ShapeTree
@@ -30,6 +29,7 @@ from train.experiments.paper import without_codes
 from train.experiments.statistics import claim, spread, stacked
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, of_method, unchanged
+from train.processes import progress_bar
 
 CHAIRS = 20
 CODES = 10
@@ -58,7 +58,7 @@ def make(study: Study) -> Outcome:
 
     def needed() -> list[OneArmedChair]:
         if not made:
-            bar = tqdm(total=number, desc="chairs", unit="chair", disable=not study.progress)
+            bar = progress_bar(total=number, title="chairs", unit="chair", progress=study.progress)
             for chair in itertools.islice(one_armed_chairs(), number):
                 made.append(chair)
                 bar.update()
