@@ -1,4 +1,4 @@
-"""`python -m benchmarks`: every op beside its peers, interleaved, medians; writes benchmarks/results/.
+"""`python -m benchmarks`: times of every op and its peers, run in turns, medians; writes benchmarks/results/.
 
 Parts: races (with each op's extra memory), memory (its growth), dispatch (of torch operators), sweep (over the number
 of points), train (a training step). `publish` puts the tables of the last run into README.md and docs/performance.md.
@@ -24,9 +24,9 @@ def main() -> int:
         prog="python -m benchmarks", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("parts", nargs="*", metavar="PART", help="what to run (default: every part)")
-    parser.add_argument("--only", default="", metavar="WORD", help="only the races whose op holds this word")
+    parser.add_argument("--only", default="", metavar="WORD", help="only races whose op contains this word")
     parser.add_argument("--seconds", type=float, default=2.0, help="time for each race (default: 2)")
-    parser.add_argument("--quick", action="store_true", help="a look in two or three minutes, not saved")
+    parser.add_argument("--quick", action="store_true", help="few runs in two or three minutes, not saved")
     parser.add_argument(
         "--out", type=Path, default=Path(__file__).parent / "results", help="where results go"
     )
@@ -58,7 +58,7 @@ def _measure(parts: list[str], arguments: argparse.Namespace) -> int:
     try:
         for part in parts:
             print(f"--- {part}", flush=True)
-            for row in _rows(part, arguments, failures):  # row by row: what there is at Ctrl-C is kept
+            for row in _rows(part, arguments, failures):  # row by row, so that Ctrl-C keeps the rows so far
                 results[part].append(row)
     except KeyboardInterrupt:
         results["interrupted"] = True
@@ -66,7 +66,7 @@ def _measure(parts: list[str], arguments: argparse.Namespace) -> int:
         print("\ninterrupted; what was measured so far:")
     print("\n" + page(results))
     if partial:
-        print("Not saved: a part of the table, or a hasty one.")
+        print("Not saved, because of --only or --quick.")
     else:
         saved.save(results, page(results), path)
         if results.get("sweep"):
@@ -93,7 +93,7 @@ def _rows(part: str, arguments: argparse.Namespace, failures: list[str]) -> Iter
         try:
             from benchmarks import training
         except ImportError as error:
-            print(f"  left out: {error} (extra [train])")
+            print(f"  skipped: {error} (extra [train])")
             return
         yield from training.measure(quick=quick)
 
@@ -119,7 +119,7 @@ def _race_rows(arguments: argparse.Namespace, failures: list[str]) -> Iterator[d
         print(" | ".join(race_line(rows)), flush=True)
         yield from rows
     if not found:
-        failures.append(f"no op holds {arguments.only!r} in its name")
+        failures.append(f"no op has {arguments.only!r} in its name")
 
 
 if __name__ == "__main__":

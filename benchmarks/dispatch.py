@@ -1,11 +1,11 @@
 """What registration with torch costs: each op as a torch operator, and as a bare `autograd.Function`.
 
-The bare ops are the same source once more, loaded with another `register`: what differs is the way from Python to the
-launch, and nothing else.
+The bare ops are the same source files, loaded with another `register`; only the path from Python to the launch differs.
 """
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import sys
 import time
@@ -19,7 +19,7 @@ from unittest import mock
 import torch
 
 import diffpoint as dp
-from benchmarks.inputs import circle_of_cameras, leaf
+from benchmarks.inputs import circle_of_cameras
 from diffpoint import _bridge
 
 _ROUNDS, _CALLS = 15, 20
@@ -27,43 +27,29 @@ _ROUNDS, _CALLS = 15, 20
 
 def measure() -> list[dict[str, Any]]:
     """Microseconds per call on tiny inputs, in turns, medians of the means over some calls."""
-    ops = {name: _bare(name) for name in ("distances", "splat", "reproject", "sampling", "transport")}
+    bare = {name: _bare(name) for name in ("distances", "splat", "reproject", "sampling", "transport")}
     generator = torch.Generator().manual_seed(0)
-    a, b = (torch.rand(1, 16, 3, generator=generator) - 0.5 for _ in range(2))
+    a, b, x = (torch.rand(1, 16, 3, generator=generator) - 0.5 for _ in range(3))
+    x.requires_grad_()
     camera = circle_of_cameras(1, 8)
-
-    def nearest(module: Any):
-        return lambda: module.nearest(a, b)
-
-    def nearest_and_back(module: Any):
-        x = leaf(a)
-        return lambda: module.nearest(x, b).squared_distance.sum().backward()
-
-    def splat(module: Any):
-        return lambda: module.splat_depth(a, camera)
-
-    def splat_and_back(module: Any):
-        x = leaf(a)
-        return lambda: module.splat_depth(x, camera).depth.clamp(max=9).sum().backward()
-
-    def project_and_back(module: Any):
-        x = leaf(a)
-        return lambda: module.project(x, camera).depth.sum().backward()
-
-    def transport(module: Any):
-        return lambda: module.earth_mover_distance(a, b)
-
-    def farthest(module: Any):
-        return lambda: module.farthest_point_sample(a, 4)
-
+    calls: dict[str, tuple[str, Callable[[Any], Any]]] = {
+        "nearest": ("distances", lambda m: m.nearest(a, b)),
+        "nearest, forward + backward": (
+            "distances",
+            lambda m: m.nearest(x, b).squared_distance.sum().backward(),
+        ),
+        "splat_depth": ("splat", lambda m: m.splat_depth(a, camera)),
+        "splat_depth, forward + backward": (
+            "splat",
+            lambda m: m.splat_depth(x, camera).depth.clamp(max=9).sum().backward(),
+        ),
+        "project, forward + backward": ("reproject", lambda m: m.project(x, camera).depth.sum().backward()),
+        "earth_mover_distance": ("transport", lambda m: m.earth_mover_distance(a, b)),
+        "farthest_point_sample (no gradient)": ("sampling", lambda m: m.farthest_point_sample(a, 4)),
+    }
     return [
-        _compare("nearest", nearest(dp), nearest(ops["distances"])),
-        _compare("nearest, forward + backward", nearest_and_back(dp), nearest_and_back(ops["distances"])),
-        _compare("splat_depth", splat(dp), splat(ops["splat"])),
-        _compare("splat_depth, forward + backward", splat_and_back(dp), splat_and_back(ops["splat"])),
-        _compare("project, forward + backward", project_and_back(dp), project_and_back(ops["reproject"])),
-        _compare("earth_mover_distance", transport(dp), transport(ops["transport"])),
-        _compare("farthest_point_sample (no gradient)", farthest(dp), farthest(ops["sampling"])),
+        _compare(op, functools.partial(call, dp), functools.partial(call, bare[module]))
+        for op, (module, call) in calls.items()
     ]
 
 
@@ -81,7 +67,7 @@ def _compare(op: str, registered: Callable[[], Any], bare: Callable[[], Any]) ->
 
 
 def _bare(module: str) -> ModuleType:
-    """`diffpoint.<module>` once more, with ops that are plain `autograd.Function`s."""
+    """A copy of `diffpoint.<module>` whose ops are plain `autograd.Function`s."""
     source = Path(dp.__file__).parent / f"{module}.py"
     name = f"benchmarks._bare_{module}"
     spec = importlib.util.spec_from_file_location(name, source)

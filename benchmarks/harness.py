@@ -1,48 +1,50 @@
-"""A race: contenders that compute the same thing, timed in turns, so that a noisy machine is noisy for all of them."""
+"""A race times implementations of one op in turns, so that other load on the machine slows all of them alike."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from benchmarks.inputs import leaf, leaf_camera
 from benchmarks.saved import machine
+from diffpoint import PinholeCamera
 
-__all__ = ["Contender", "Disagreement", "Race", "machine", "run"]
+__all__ = ["Contender", "Disagreement", "Race", "Way", "both_directions", "machine", "run"]
 
 Direction = Literal["forward", "forward + backward"]
 
-_ROUNDS = 3  # of every contender that takes less than
-_LONG = 1.0  # seconds; others run twice, the warm-up included
-_FAR_BEHIND = 6  # times our time: further rounds of such a contender would tell nothing more
+_ROUNDS = 3  # at least, of a contender that takes less than _LONG; others run twice, including the warm-up
+_LONG = 1.0  # seconds
+_FAR_BEHIND = 6  # times our time; such a contender gets no further rounds
 
 
 class Disagreement(RuntimeError):
-    """A contender computes something else than we do, and nobody said so."""
+    """A contender without a remark computes something else than we do."""
 
 
 @dataclass(frozen=True)
 class Contender:
-    """One way to compute the result."""
+    """One implementation."""
 
     name: str
     run: Callable[[], Any]
     value: Callable[[Any], Tensor] | None = None
-    """What of the result is compared with ours; None where the peer gives nothing comparable."""
+    """The part of the result that is compared with ours; None if nothing is comparable."""
     remark: str = ""
-    """Said in the table, e.g. that a peer approximates; a peer with a remark may differ."""
+    """For the table, e.g. that a peer approximates; the result of a peer with a remark may differ from ours."""
     units: int | None = None
-    """Clouds or pairs in one run, where not as many as the race's; the first ones of the same input."""
+    """Number of clouds or pairs in one run, if less than in the race; the first ones of the same input."""
 
 
 @dataclass(frozen=True)
 class Race:
-    """Ours against peers, on one input."""
+    """Our implementation and those of peers on one input."""
 
     op: str
     size: str
@@ -50,11 +52,69 @@ class Race:
     peers: list[Contender] = field(default_factory=list)
     direction: Direction = "forward"
     units: int = 1
-    """Clouds or pairs in one run: times are given per unit."""
+    """Number of clouds or pairs in one run; times are per unit."""
     tolerance: float = 1e-4
     """Values differ if they are further apart than this, relative to the largest."""
     share: float = 0.0
-    """How much of the result may differ: the step functions of rendering, and equally near neighbours."""
+    """Share of the values that may differ, because of step functions in rendering and ties between neighbours."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """An implementation as a function of its inputs, from which `both_directions` makes contenders.
+
+    Attributes:
+        name: of the contender.
+        function: of points, depth maps and cameras.
+        value: the part of its result to compare.
+        loss: a scalar of its result to differentiate; None: leave the implementation out of the backward race.
+        units: if less than in the race, the number of clouds that it gets.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    value: Callable[[Any], Tensor]
+    loss: Callable[[Any], Tensor] | None = None
+    remark: str = ""
+    units: int | None = None
+
+
+def both_directions(
+    op: str,
+    size: str,
+    inputs: tuple[Tensor | PinholeCamera, ...],
+    ours: Way,
+    peers: list[Way],
+    *,
+    directions: tuple[Direction, ...] = ("forward", "forward + backward"),
+    **options: Any,
+) -> Iterator[Race]:
+    """The races of an op, forward and with gradients to all of its inputs."""
+    for direction in directions:
+        backward = direction != "forward"
+
+        def contender(way: Way, backward: bool = backward) -> Contender:
+            own = inputs if way.units is None else tuple(x[: way.units] for x in inputs)
+            if not backward:
+                return Contender(way.name, lambda: way.function(*own), way.value, way.remark, way.units)
+            return Contender(way.name, lambda: _descend(way, own), _gradients, way.remark, way.units)
+
+        raced = [contender(peer) for peer in peers if peer.loss or not backward]
+        yield Race(op, size, contender(ours), raced, direction, **options)
+
+
+def _descend(way: Way, inputs: tuple[Tensor | PinholeCamera, ...]) -> tuple[list[Tensor], list[Tensor]]:
+    """Copies of all inputs, and their gradients."""
+    assert way.loss is not None
+    leaves = [leaf(x) if isinstance(x, Tensor) else leaf_camera(x) for x in inputs]
+    way.loss(way.function(*leaves)).backward()
+    tensors = [t for x in leaves for t in ((x,) if isinstance(x, Tensor) else (x.K, x.cam_from_world))]
+    return tensors, [t.grad for t in tensors if t.grad is not None]
+
+
+def _gradients(result: tuple[list[Tensor], list[Tensor]]) -> Tensor:
+    """(B, ...) all gradients, each relative to its largest value."""
+    return torch.cat([g.flatten(1) / g.abs().max().clamp(min=1e-30) for g in result[1]], 1)
 
 
 def run(race: Race, *, seconds: float) -> list[dict[str, Any]]:
@@ -70,7 +130,7 @@ def run(race: Race, *, seconds: float) -> list[dict[str, Any]]:
     contenders = [race.ours]
     for peer in race.peers:
         try:
-            theirs = _value(peer, peer.run())  # compiles and warms up, too
+            theirs = _value(peer, peer.run())  # also compiles and warms up
         except Exception as error:
             reason = str(error).strip().splitlines()
             print(
@@ -124,10 +184,10 @@ def _value(contender: Contender, result: Any) -> Tensor | None:
 
 
 def _differing_share(race: Race, peer: Contender, ours: Tensor | None, theirs: Tensor | None) -> float | None:
-    """Share of the values that differ; an error where more do than may."""
+    """Share of the values that differ; an error if it is more than `race.share`."""
     if ours is None or theirs is None:
         return None
-    ours = ours[: len(theirs)]  # a slow peer may do the first units only
+    ours = ours[: len(theirs)]  # a slow peer computes only the first units
     if ours.shape != theirs.shape:
         raise Disagreement(
             f"{race.op} {race.size}: {peer.name} gives {tuple(theirs.shape)}, we {tuple(ours.shape)}"

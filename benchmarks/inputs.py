@@ -1,4 +1,4 @@
-"""What every contender gets: clouds on surfaces, pairs as in the middle of a training, cameras on a circle."""
+"""Inputs of the benchmarks: clouds on surfaces, pairs as in the middle of a training, cameras on a circle."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def surfaces(count: int, points: int, *, seed: int = 0) -> Tensor:
 
 
 def pairs(count: int, n: int, m: int) -> tuple[Tensor, Tensor]:
-    """A truth and a noisy prediction of it, as in the middle of a training: (count, n, 3) and (count, m, 3)."""
+    """Noisy predictions (count, n, 3) and their targets (count, m, 3), as in the middle of a training."""
     both = surfaces(count, n + m)
     noise = 0.03 * torch.randn(count, n, 3, generator=torch.Generator().manual_seed(1))
     return (both[:, :n] + noise).contiguous(), both[:, n:].contiguous()
@@ -44,16 +44,10 @@ def depth_maps(count: int, size: int) -> tuple[Tensor, dp.PinholeCamera]:
 
 
 def leaf(tensor: Tensor) -> Tensor:
-    """A copy to which a gradient flows."""
+    """A copy that gets a gradient."""
     return tensor.detach().clone().requires_grad_()
 
 
 def leaf_camera(camera: dp.PinholeCamera) -> dp.PinholeCamera:
-    """A copy with gradients to its matrices."""
+    """A copy whose matrices get gradients."""
     return dp.PinholeCamera(leaf(camera.K), leaf(camera.cam_from_world), camera.height, camera.width)
-
-
-def gradient(tensor: Tensor) -> Tensor:
-    """What flowed to a leaf."""
-    assert tensor.grad is not None
-    return tensor.grad

@@ -1,7 +1,7 @@
 """Peak extra memory of the ops: bytes beyond inputs and outputs, read from Linux's high-water mark.
 
 Measured in a process of its own (`python -m benchmarks.memory` is what `python -m benchmarks` starts), whose allocator
-gives every large block back: a peak is then what the op itself needed. Elsewhere than on Linux nothing is measured.
+returns every large block when it is freed, so that the peak is due to the op. On other systems nothing is measured.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from benchmarks.inputs import circle_of_cameras, leaf, pairs, surfaces
 
 _STATUS = Path("/proc/self/status")
 _GROWTH = 4
-"""The larger set has so many times the points of the smaller one."""
+"""Number of points of the larger input, relative to the smaller one."""
 
 
 def measure(what: str) -> Iterator[dict[str, Any]]:
@@ -74,12 +74,12 @@ def main(what: str, word: str = "") -> None:
 
 
 def extra_bytes(call: Callable[[], Any]) -> int:
-    """What the process holds at the peak of a call beyond what it holds before and what the call returns."""
+    """Peak memory of the process in a call, minus the memory before it and that of the result."""
     call()  # compiles
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
     before = _read("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")  # the high-water mark falls to the present
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     result = call()
     return max(0, _read("VmHWM") - before - _size(result))
 
@@ -101,32 +101,27 @@ Case = tuple[str, Callable[[int], int], Callable[[int], Callable[[], Any]]]
 def _cases() -> Iterator[Case]:
     """Name, N + M + H W by factor, and the call by factor. Batches are small: extra memory per thread shows."""
 
+    def case(op: str, size: str, elements: int, inputs: Callable[[int], tuple], call: Callable) -> Case:
+        def prepare(factor: int) -> Callable[[], Any]:
+            own = inputs(factor)
+            return lambda: call(*own)
+
+        return f"{op}, 2 x {size}", lambda factor: 2 * factor * elements, prepare
+
     def two_sets(op: str, base: int, call: Callable[[Tensor, Tensor], Any]) -> Case:
-        def prepare(factor: int) -> Callable[[], Any]:
-            a, b = pairs(2, factor * base, factor * base)
-            return lambda: call(a, b)
-
-        return f"{op}, 2 x N x N", lambda factor: 2 * 2 * factor * base, prepare
-
-    def one_set(op: str, base: int, call: Callable[[Tensor], Any]) -> Case:
-        def prepare(factor: int) -> Callable[[], Any]:
-            points = surfaces(2, factor * base)
-            return lambda: call(points)
-
-        return f"{op}, 2 x N", lambda factor: 2 * factor * base, prepare
+        return case(op, "N x N", 2 * base, lambda factor: pairs(2, factor * base, factor * base), call)
 
     def rendered(op: str, call: Callable[[Tensor, dp.PinholeCamera], Any]) -> Case:
-        def prepare(factor: int) -> Callable[[], Any]:
-            points, camera = surfaces(2, factor * 65536), circle_of_cameras(2, round(256 * factor**0.5))
-            return lambda: call(points, camera)
+        def inputs(factor: int) -> tuple[Tensor, dp.PinholeCamera]:
+            return surfaces(2, factor * 65536), circle_of_cameras(2, round(256 * factor**0.5))
 
-        return f"{op}, 2 x N, sqrt(N) x sqrt(N)", lambda factor: 2 * 2 * factor * 65536, prepare
+        return case(op, "N, sqrt(N) x sqrt(N)", 2 * 65536, inputs, call)
 
     def with_gradient(loss: Callable[..., Tensor]) -> Callable[..., Any]:
         def run(*inputs: Any) -> list[Tensor | None]:
             leaves = [leaf(x) if isinstance(x, Tensor) else x for x in inputs]
             loss(*leaves).sum().backward()
-            # The leaves, copies of the inputs, are no more the op's than its gradients, which are results.
+            # Neither the leaves, copies of the inputs, nor their gradients count as extra memory of the op.
             tensors = [x for x in leaves if isinstance(x, Tensor)]
             return [*tensors, *(x.grad for x in tensors)]
 
@@ -141,7 +136,13 @@ def _cases() -> Iterator[Case]:
     yield two_sets("chamfer_distance forward + backward", 65536, with_gradient(chamfer))
     yield two_sets("earth_mover_distance", 2048, dp.earth_mover_distance)
     yield two_sets("approxmatch", 2048, dp.approxmatch)
-    yield one_set("farthest_point_sample of 64", 262144, lambda x: dp.farthest_point_sample(x, 64))
+    yield case(
+        "farthest_point_sample of 64",
+        "N",
+        262144,
+        lambda factor: (surfaces(2, factor * 262144),),
+        lambda x: dp.farthest_point_sample(x, 64),
+    )
     yield rendered("splat_depth", dp.splat_depth)
     yield rendered("splat_depth, radius 1", lambda x, camera: dp.splat_depth(x, camera, radius=1.0))
     yield rendered(

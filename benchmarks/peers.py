@@ -1,4 +1,4 @@
-"""Peers that may not be installed (extra [bench]), and how a batch is put through those that know only one cloud."""
+"""Peers that may not be installed (extra [bench]), and a loop for those that take a single cloud."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 @functools.cache
 def optional(name: str) -> ModuleType | None:
-    """The module; None where it is missing or does not load, with a printed line, once."""
+    """The module; None, with a line printed once, if it is missing or cannot be imported."""
     if os.environ.get("BENCHMARKS_WITHOUT_PEERS"):
         return None
     try:
@@ -27,7 +27,7 @@ def optional(name: str) -> ModuleType | None:
 
 @functools.cache
 def keops() -> ModuleType | None:
-    """pykeops.torch if it can compile here: it does so at first use, and needs a C++ compiler."""
+    """pykeops.torch if it can be imported, which needs a C++ compiler."""
     module = optional("pykeops")
     if module is None:
         return None

@@ -1,21 +1,20 @@
-"""`python -m benchmarks publish`: the last run's tables, put between the marks in README.md and docs/performance.md."""
+"""`python -m benchmarks publish`: the last run's tables, put between the comments `<!-- begin NAME -->` and
+`<!-- end NAME -->` in README.md and docs/performance.md."""
 
 from __future__ import annotations
 
 import re
 import shutil
 from pathlib import Path
-from typing import Any
 
 from benchmarks import saved, tables
-from benchmarks.marks import marks
 
 ROOT = Path(__file__).parent.parent
 FIGURE = Path("docs/images/sweep.png")
 
 
 def publish(folder: Path, root: Path = ROOT) -> int:
-    """Exit code 1 where this machine has no results yet."""
+    """Returns exit code 1 if this machine has no results yet."""
     here = saved.machine()
     path = saved.path_for(folder, here)
     results = saved.load(folder, here)
@@ -28,7 +27,7 @@ def publish(folder: Path, root: Path = ROOT) -> int:
     reasons = _reasons(guide.read_text(encoding="utf-8"))
     blocks = {
         "machine": f"Measured on: {measured_on}.",
-        "marks": _marks(results, reasons),
+        "targets": tables.targets_table(results, reasons),
         "races": tables.race_table(results["races"]),
         "sweep": tables.sweep_table(results["sweep"]),
         "memory": tables.memory_table(results["memory"]),
@@ -43,7 +42,7 @@ def publish(folder: Path, root: Path = ROOT) -> int:
 
 
 def _insert(page: Path, blocks: dict[str, str]) -> None:
-    """Replaces what stands between `<!-- begin NAME -->` and `<!-- end NAME -->`."""
+    """Replaces the text between the comments."""
     text = page.read_text(encoding="utf-8")
     for name, block in blocks.items():
         begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
@@ -54,15 +53,8 @@ def _insert(page: Path, blocks: dict[str, str]) -> None:
     saved.write(page, text)
 
 
-def _marks(results: dict[str, Any], reasons: dict[str, str]) -> str:
-    """The table of marks with the reasons that were written into it by hand."""
-    said = {True: "met", False: "**not met**", None: "not measured"}
-    lines = [[m.name, m.wanted, m.measured, said[m.met], reasons.get(m.name, "")] for m in marks(results)]
-    return tables.markdown(["mark", "wanted", "measured", "", "why, and what was tried"], lines)
-
-
 def _reasons(guide: str) -> dict[str, str]:
-    """The last column of the table of marks, by the first."""
-    found = re.search(r"<!-- begin marks -->(.*)<!-- end marks -->", guide, re.DOTALL)
+    """The last column of the table of targets, which is written by hand, by the first column."""
+    found = re.search(r"<!-- begin targets -->(.*)<!-- end targets -->", guide, re.DOTALL)
     rows = [line.strip("| ").split(" | ") for line in (found[1] if found else "").splitlines() if "|" in line]
     return {row[0]: row[4].strip() for row in rows if len(row) == 5}

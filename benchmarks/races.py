@@ -1,4 +1,4 @@
-"""What is raced: every op at the sizes of the paper's training step, beside every peer that is installed."""
+"""All races: every op at the sizes of the paper's training step, and every installed peer."""
 
 from __future__ import annotations
 

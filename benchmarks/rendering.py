@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,18 +10,15 @@ from torch import Tensor
 
 import diffpoint as dp
 from benchmarks import numba_peers, torch_peers
-from benchmarks.harness import Contender, Race
-from benchmarks.inputs import circle_of_cameras, depth_maps, gradient, leaf, leaf_camera, surfaces
+from benchmarks.harness import Contender, Race, Way, both_directions
+from benchmarks.inputs import circle_of_cameras, depth_maps, surfaces
 from benchmarks.peers import each, optional
-from diffpoint import reference
+from diffpoint import PinholeCamera, reference
 from diffpoint._horizon import FILTERS
 from diffpoint.visibility import _DEFAULTS, METHODS, Method, _limit
 
-Leaves = tuple[Any, ...]
-"""Points or depths, then the cameras that see them, whose gradients a run leaves behind."""
-
 _BORDER = 0.01
-"""Share of the pixels about which two renderers may differ: a point on the border falls into either."""
+"""Share of the pixels that may differ between renderers: rounding moves points on a border into either pixel."""
 
 
 def races() -> Iterator[Race]:
@@ -34,57 +30,54 @@ def races() -> Iterator[Race]:
         (1, 2048, 56, 0),
         (1, 10_000, 56, 0),
     ):
-        yield _splat(count, n, size, radius)
-    yield _splat_backward(80, 2048, 56)
-    yield _splat_backward(80, 2048, 224)
-    yield _sample(80, 2048, 56)
-    yield _sample_backward(80, 2048, 56)
+        yield from _splat(count, n, size, radius)
+    yield from _sample(80, 2048, 56)
     for method in METHODS:
         yield _visible(80 if method != "hpr" else 8, 2048, 56, method)
-    yield _project(80, 2048)
-    yield _project_backward(80, 2048)
-    yield _unproject(80, 56)
-    yield _unproject_backward(80, 56)
-    yield _reproject(80, 56)
-    yield _reproject_backward(80, 56)
+    yield from _project(80, 2048)
+    yield from _unproject(80, 56)
+    yield from _reproject(80, 56)
 
 
 def _inverse(depth: Tensor) -> Tensor:
-    """Empty pixels, at infinity, become 0."""
+    """1 / depth, which is 0 at empty pixels."""
     return 1 / depth.flatten(1)
 
 
-def _splat_name(radius: int) -> str:
-    return "splat_depth" if radius == 0 else f"splat_depth, radius {radius}"
+def _finite_sum(*values: Tensor) -> Tensor:
+    return torch.stack([torch.where(torch.isfinite(v), v, 0.0).sum() for v in values]).sum()
 
 
-def _splat(count: int, n: int, size: int, radius: int) -> Race:
+def _splat(count: int, n: int, size: int, radius: int) -> Iterator[Race]:
     points, camera = surfaces(count, n), circle_of_cameras(count, size)
-    projection = camera.projection[:, 0]
-    peers = [
-        Contender(
-            "torch scatter_reduce",
-            lambda: torch_peers.splat(points, projection, size, radius=radius),
-            lambda r: _inverse(r[0]),
-        )
-    ]
+    weight = torch.rand(count, size, size, generator=torch.Generator().manual_seed(0))
+
+    def loss(depth: Tensor) -> Tensor:
+        return _finite_sum(weight * depth.view(count, size, size))
+
+    def in_torch(x: Tensor, y: PinholeCamera) -> Tensor:
+        return torch_peers.splat(x, y.projection[:, 0], size, radius=radius)[0]
+
+    peers = [Way("torch scatter_reduce", in_torch, _inverse, loss)]
     if numba := optional("numba"):
-        run = lambda: numba_peers.splat(numba, points, projection, size, radius)  # noqa: E731
-        peers.append(Contender("numba", run, _inverse))
+        projection = camera.projection[:, 0]
+        run = lambda x, y: numba_peers.splat(numba, x, projection, size, radius)  # noqa: E731
+        peers.append(Way("numba", run, _inverse))
     if radius == 0:
-        peers += [*_open3d_splat(points, camera), *_pytorch3d_splat(points, projection, size)]
-    ours = lambda: dp.splat_depth(points, camera, radius=float(radius))  # noqa: E731
-    return Race(
-        _splat_name(radius),
+        peers += [*_open3d_splat(points, camera), *_pytorch3d_splat(size)]
+    yield from both_directions(
+        "splat_depth" if radius == 0 else f"splat_depth, radius {radius}",
         f"{count} x {n}, {size} x {size}",
-        Contender("diffpoint", ours, lambda r: _inverse(r.depth)),
+        (points, camera),
+        Way("diffpoint", lambda x, y: dp.splat_depth(x, y, radius=float(radius)).depth, _inverse, loss),
         peers,
+        directions=("forward", "forward + backward") if count > 1 and radius == 0 else ("forward",),
         units=count,
         share=_BORDER,
     )
 
 
-def _open3d_splat(points: Tensor, camera: dp.PinholeCamera) -> Iterator[Contender]:
+def _open3d_splat(points: Tensor, camera: PinholeCamera) -> Iterator[Way]:
     open3d = optional("open3d")
     if open3d is None:
         return
@@ -93,7 +86,7 @@ def _open3d_splat(points: Tensor, camera: dp.PinholeCamera) -> Iterator[Contende
     K = [from_numpy(m.double().numpy()) for m in camera.K[:, 0].contiguous()]
     E = [from_numpy(m.double().numpy()) for m in camera.cam_from_world[:, 0].contiguous()]
 
-    def run() -> list:
+    def run(*_) -> list:
         size = camera.width, camera.height
         return each(
             len(clouds),
@@ -104,16 +97,16 @@ def _open3d_splat(points: Tensor, camera: dp.PinholeCamera) -> Iterator[Contende
         depth = torch.from_numpy(np.stack([image.as_tensor().numpy()[..., 0] for image in images]))
         return torch.where(depth > 0, _inverse(depth).view(depth.shape), 0.0).flatten(1)
 
-    yield Contender("open3d", run, value, "depth only; rounds positions")
+    yield Way("open3d", run, value, remark="depth only; rounds positions")
 
 
-def _pytorch3d_splat(points: Tensor, projection: Tensor, size: int) -> Iterator[Contender]:
+def _pytorch3d_splat(size: int) -> Iterator[Way]:
     renderer, structures = optional("pytorch3d.renderer.points"), optional("pytorch3d.structures")
     if renderer is None or structures is None:
         return
 
-    def run() -> Tensor:
-        u, v, depth = torch_peers.project(points, projection).unbind(-1)
+    def run(points: Tensor, camera: PinholeCamera) -> Tensor:
+        u, v, depth = torch_peers.project(points, camera.projection[:, 0]).unbind(-1)
         ndc = torch.stack((1 - 2 * u / depth / size, 1 - 2 * v / depth / size, depth), -1)
         cloud = structures.Pointclouds(list(ndc))
         return renderer.rasterize_points(cloud, size, radius=1 / size, points_per_pixel=1)[1][..., 0]
@@ -121,68 +114,22 @@ def _pytorch3d_splat(points: Tensor, projection: Tensor, size: int) -> Iterator[
     def value(depth: Tensor) -> Tensor:
         return torch.where(depth > 0, 1 / depth, 0.0).flatten(1)
 
-    yield Contender("pytorch3d", run, value, "discs of half a pixel")
+    yield Way("pytorch3d", run, value, remark="discs of half a pixel")
 
 
-def _splat_backward(count: int, n: int, size: int) -> Race:
-    points, camera = surfaces(count, n), circle_of_cameras(count, size)
-    weight = torch.rand(count, size, size, generator=torch.Generator().manual_seed(0))
-
-    def descend(depth_of) -> Tensor:
-        x, y = leaf(points), leaf_camera(camera)
-        depth = depth_of(x, y)
-        (weight * torch.where(torch.isfinite(depth), depth, 0.0)).sum().backward()
-        return gradient(x)
-
-    def in_torch(x: Tensor, y: dp.PinholeCamera) -> Tensor:
-        return torch_peers.splat(x, y.projection[:, 0], size)[0]
-
-    return Race(
-        _splat_name(0),
-        f"{count} x {n}, {size} x {size}",
-        Contender("diffpoint", lambda: descend(lambda x, y: dp.splat_depth(x, y).depth[:, 0]), lambda g: g),
-        [Contender("torch scatter_reduce", lambda: descend(in_torch), lambda g: g)],
-        direction="forward + backward",
-        units=count,
-        share=_BORDER,
-    )
-
-
-def _sample(count: int, n: int, size: int) -> Race:
+def _sample(count: int, n: int, size: int) -> Iterator[Race]:
     points = surfaces(count, n)
     splat = dp.splat_depth(points, circle_of_cameras(count, size))
     visible = splat.visible[:, 0].contiguous()
-    return Race(
-        "sample_view",
-        f"{count} x {n}, {size} x {size}",
-        Contender("diffpoint", lambda: dp.sample_view(points, splat), lambda r: r.points[:, 0]),
-        [Contender("torch argsort", lambda: torch_peers.sample(points, visible), lambda r: r[0])],
-        units=count,
-    )
-
-
-def _sample_backward(count: int, n: int, size: int) -> Race:
-    points = surfaces(count, n)
-    splat = dp.splat_depth(points, circle_of_cameras(count, size))
-    visible = splat.visible[:, 0].contiguous()
-
-    def descend(sample) -> Tensor:
-        x = leaf(points)
-        sample(x).square().sum().backward()
-        return gradient(x)
-
-    return Race(
-        "sample_view",
-        f"{count} x {n}, {size} x {size}",
-        Contender("diffpoint", lambda: descend(lambda x: dp.sample_view(x, splat).points), lambda g: g),
-        [
-            Contender(
-                "torch argsort", lambda: descend(lambda x: torch_peers.sample(x, visible)[0]), lambda g: g
-            )
-        ],
-        direction="forward + backward",
-        units=count,
-    )
+    ways = [
+        Way(name, function, lambda r: r, lambda r: r.square().sum())
+        for name, function in (
+            ("diffpoint", lambda x: dp.sample_view(x, splat).points[:, 0]),
+            ("torch argsort", lambda x: torch_peers.sample(x, visible)[0]),
+        )
+    ]
+    size_text = f"{count} x {n}, {size} x {size}"
+    yield from both_directions("sample_view", size_text, (points,), ways[0], ways[1:], units=count)
 
 
 def _visible(count: int, n: int, size: int, method: Method) -> Race:
@@ -217,7 +164,7 @@ def _visible(count: int, n: int, size: int, method: Method) -> Race:
     )
 
 
-def _open3d_hidden(points: Tensor, camera: dp.PinholeCamera) -> Iterator[Contender]:
+def _open3d_hidden(points: Tensor, camera: PinholeCamera) -> Iterator[Contender]:
     open3d = optional("open3d")
     if open3d is None:
         return
@@ -231,140 +178,60 @@ def _open3d_hidden(points: Tensor, camera: dp.PinholeCamera) -> Iterator[Contend
     yield Contender("open3d", run, remark="the same test, another sphere")
 
 
-def _project(count: int, n: int) -> Race:
-    points, camera = surfaces(count, n), circle_of_cameras(count, 56)
-
-    def in_torch() -> tuple[Tensor, Tensor]:
-        q = torch_peers.project(points, camera.projection[:, 0])
+def _project(count: int, n: int) -> Iterator[Race]:
+    def in_torch(x: Tensor, y: PinholeCamera) -> tuple[Tensor, Tensor]:
+        q = torch_peers.project(x, y.projection[:, 0])
         return q[..., :2] / q[..., 2:], q[..., 2]
 
-    return Race(
+    def loss(r: tuple[Tensor, Tensor]) -> Tensor:
+        return r[0].sum() + r[1].sum()
+
+    yield from both_directions(
         "project",
         f"{count} x {n}",
-        Contender("diffpoint", lambda: dp.project(points, camera), lambda r: r.pixels[:, 0]),
-        [Contender("torch", in_torch, lambda r: r[0])],
+        (surfaces(count, n), circle_of_cameras(count, 56)),
+        Way("diffpoint", dp.project, lambda r: r.pixels[:, 0], loss),
+        [Way("torch", in_torch, lambda r: r[0], loss)],
         units=count,
     )
 
 
-def _project_backward(count: int, n: int) -> Race:
-    points, camera = surfaces(count, n), circle_of_cameras(count, 56)
+def _unproject(count: int, size: int) -> Iterator[Race]:
+    def loss(r: tuple[Tensor, Tensor]) -> Tensor:
+        return r[0].square().sum()
 
-    def ours() -> Leaves:
-        x, y = leaf(points), leaf_camera(camera)
-        pixels, depth = dp.project(x, y)
-        (pixels.sum() + depth.sum()).backward()
-        return x, y
-
-    def in_torch() -> Leaves:
-        x, y = leaf(points), leaf_camera(camera)
-        q = torch_peers.project(x, y.projection[:, 0])
-        ((q[..., :2] / q[..., 2:]).sum() + q[..., 2].sum()).backward()
-        return x, y
-
-    return Race(
-        "project",
-        f"{count} x {n}",
-        Contender("diffpoint", ours, _gradients),
-        [Contender("torch", in_torch, _gradients)],
-        direction="forward + backward",
-        units=count,
-    )
-
-
-def _gradients(descended: Leaves) -> Tensor:
-    """Of points or depths, and of the cameras' matrices, in one (B, ...) tensor, each relative to its own size."""
-    x, *cameras = descended
-    leaves = [x, *(m for y in cameras for m in (y.K, y.cam_from_world))]
-    flat = [gradient(one).flatten(1) for one in leaves if one.grad is not None]
-    return torch.cat([g / g.abs().max() for g in flat], 1)
-
-
-def _unproject(count: int, size: int) -> Race:
-    depth, camera = depth_maps(count, size)
-    one_each = depth[:, 0]
-    return Race(
+    yield from both_directions(
         "unproject",
         f"{count} x {size} x {size}",
-        Contender("diffpoint", lambda: dp.unproject(depth, camera), lambda r: r.points[:, 0]),
-        [Contender("torch argsort", lambda: torch_peers.unproject(one_each, camera), lambda r: r[0])],
-        units=count,
-    )
-
-
-def _unproject_backward(count: int, size: int) -> Race:
-    depth, camera = depth_maps(count, size)
-
-    def ours() -> Leaves:
-        x, y = leaf(depth), leaf_camera(camera)
-        dp.unproject(x, y).points.square().sum().backward()
-        return x, y
-
-    def in_torch() -> Leaves:
-        x, y = leaf(depth), leaf_camera(camera)
-        torch_peers.unproject(x[:, 0], y)[0].square().sum().backward()
-        return x, y
-
-    return Race(
-        "unproject",
-        f"{count} x {size} x {size}",
-        Contender("diffpoint", ours, _gradients),
-        [Contender("torch argsort", in_torch, _gradients)],
-        direction="forward + backward",
+        depth_maps(count, size),
+        Way("diffpoint", dp.unproject, lambda r: r.points[:, 0], loss),
+        [Way("torch argsort", lambda x, y: torch_peers.unproject(x[:, 0], y), lambda r: r[0], loss)],
         units=count,
         tolerance=1e-3,
     )
 
 
-def _reproject(count: int, size: int) -> Race:
+def _reproject(count: int, size: int) -> Iterator[Race]:
     depth, camera = depth_maps(count, size)
     target = circle_of_cameras(count, size)[torch.arange(count).roll(1)]
-    one_each = depth[:, 0]
-    return Race(
+    yield from both_directions(
         "reproject",
         f"{count} x {size} x {size}",
-        Contender(
+        (depth, camera, target),
+        Way(
             "diffpoint",
-            lambda: dp.reproject(depth, camera, target),
-            lambda r: _inverse(r.depth[:, 0]),
+            lambda x, y, z: dp.reproject(x, y, z)[:3],
+            lambda r: _inverse(r[2][:, 0]),
+            lambda r: _finite_sum(*r),
         ),
         [
-            Contender(
+            Way(
                 "torch",
-                lambda: torch_peers.reproject(one_each, camera, target),
+                lambda x, y, z: torch_peers.reproject(x[:, 0], y, z),
                 lambda r: _inverse(r[2]),
+                lambda r: _finite_sum(*r),
             )
         ],
-        units=count,
-    )
-
-
-def _reproject_backward(count: int, size: int) -> Race:
-    depth, camera = depth_maps(count, size)
-    target = circle_of_cameras(count, size)[torch.arange(count).roll(1)]
-
-    def ours() -> Leaves:
-        x, y, z = leaf(depth), leaf_camera(camera), leaf_camera(target)
-        seen = dp.reproject(x, y, z)
-        foreground = torch.isfinite(seen.depth)
-        total = torch.where(foreground[..., None], seen.pixels, 0.0).sum()
-        (total + torch.where(foreground, seen.depth, 0.0).sum() + seen.points.sum()).backward()
-        return x, y, z
-
-    def in_torch() -> Leaves:
-        x, y, z = leaf(depth), leaf_camera(camera), leaf_camera(target)
-        world, pixels, seen_depth = torch_peers.reproject(x[:, 0], y, z)
-        foreground = torch.isfinite(seen_depth)
-        total = torch.where(foreground[:, None], pixels, 0.0).sum()
-        (total + torch.where(foreground, seen_depth, 0.0).sum() + world.sum()).backward()
-        return x, y, z
-
-    return Race(
-        "reproject",
-        f"{count} x {size} x {size}",
-        Contender("diffpoint", ours, _gradients),
-        [Contender("torch", in_torch, _gradients)],
-        direction="forward + backward",
         units=count,
         tolerance=1e-3,
     )

@@ -1,4 +1,4 @@
-"""What a run leaves behind: `<machine>.json` with every number, `<machine>.md` with the tables."""
+"""Files of a run: `<machine>.json` with every number, `<machine>.md` with the tables."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import diffpoint
 
 
 def machine() -> dict[str, Any]:
-    """What the times belong to."""
+    """The machine and versions that the times were measured with."""
     info = diffpoint.runtime_info()
     return {
         "processor": info.processor,
@@ -51,7 +51,7 @@ def save(results: dict[str, Any], page: str, path: Path) -> None:
 
 
 def write(path: Path, text: str) -> None:
-    """At once: an interrupted run leaves the old file or the new one."""
+    """Atomically: an interrupted run leaves the old file or the new one."""
     unfinished = path.with_name(path.name + ".new")
     unfinished.write_text(text, encoding="utf-8")
     unfinished.replace(path)

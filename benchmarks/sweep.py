@@ -17,7 +17,7 @@ BATCHES = (1, 16, 80)
 FITTED_FROM = 2**14
 _LARGEST = {"farthest_point_sample, N / 8": 2**16}
 _RUNS = 3
-_POINTS = 80 * 2**18  # in a batch: memory
+_POINTS = 80 * 2**18  # in a batch, because of memory
 
 Prepare = Callable[[int, int], Callable[[], Any]]
 
@@ -45,21 +45,21 @@ OPS: dict[str, Prepare] = {
 
 
 def measure(*, longest: float, sizes: tuple[int, ...] = SIZES) -> Iterator[dict[str, Any]]:
-    """Rows of milliseconds per batch; sizes whose run would exceed `longest` seconds are left out, with a line.
+    """Rows of milliseconds per batch; sizes whose run would exceed `longest` seconds are skipped, with a line.
 
     Args:
-        longest: seconds that one run may take, as foretold by the size before.
+        longest: seconds that one run may take, extrapolated from the size before.
         sizes: numbers of points.
     """
     for op, prepare in OPS.items():
         for batch in BATCHES:
             before: tuple[int, float] | None = None
             for n in (n for n in sizes if n <= _LARGEST.get(op, n)):
-                # Half-way between linear and square, until it is measured.
-                foretold = before[1] * (n / before[0]) ** 1.3 if before else 0.0
-                if foretold > longest or batch * n > _POINTS:
-                    why = f"{foretold:.0f} s a run" if foretold > longest else "memory"
-                    print(f"  {op}: {batch} x {n} and larger left out ({why})", flush=True)
+                # Between linear and quadratic.
+                expected = before[1] * (n / before[0]) ** 1.3 if before else 0.0
+                if expected > longest or batch * n > _POINTS:
+                    why = f"{expected:.0f} s a run" if expected > longest else "memory"
+                    print(f"  {op}: {batch} x {n} and larger skipped ({why})", flush=True)
                     break
                 call = prepare(batch, n)
                 call()  # compiles

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.marks import marks
 from benchmarks.saved import title
 from benchmarks.sweep import exponent
+from benchmarks.targets import targets
 
 Rows = list[dict[str, Any]]
 
@@ -41,7 +41,7 @@ def page(results: dict[str, Any]) -> str:
         parts += ["## What registration with torch costs", dispatch_table(rows)]
     if rows := results.get("train"):
         parts += ["## A training step", training_table(rows)]
-    return "\n\n".join([*parts, "## Marks", marks_table(results)]) + "\n"
+    return "\n\n".join([*parts, "## Targets", targets_table(results)]) + "\n"
 
 
 def markdown(header: list[str], rows: list[list[str]]) -> str:
@@ -144,7 +144,10 @@ def training_table(rows: Rows) -> str:
             f"{r['ms']:.0f}",
             *(f"{r['shares'].get(name, 0):.0%}" for name in parts),
             f"{r['layer_share']:.0%}",
-            *("" if r.get(name) is None else f"{r[name]:.1f}x" for name in ("twins_ratio", "scipy_ratio")),
+            *(
+                "" if r.get(name) is None else f"{r[name]:.1f}x"
+                for name in ("reference_ratio", "scipy_ratio")
+            ),
         ]
         for r in rows
     ]
@@ -154,13 +157,18 @@ def training_table(rows: Rows) -> str:
         "ms a step",
         *parts,
         "layer in all",
-        "with the torch twins",
-        "and scipy's assignment",
+        "with diffpoint.reference",
+        "with scipy's assignment too",
     ]
     return markdown(header, lines)
 
 
-def marks_table(results: dict[str, Any]) -> str:
-    said = {True: "met", False: "**not met**", None: "not measured"}
-    lines = [[m.name, m.wanted, m.measured, said[m.met]] for m in marks(results)]
-    return markdown(["mark", "wanted", "measured", ""], lines)
+def targets_table(results: dict[str, Any], reasons: dict[str, str] | None = None) -> str:
+    """With `reasons`, by name, a last column for them."""
+    words = {True: "met", False: "**not met**", None: "not measured"}
+    header = ["target", "wanted", "measured", ""]
+    lines = [[t.name, t.wanted, t.measured, words[t.met]] for t in targets(results)]
+    if reasons is not None:
+        header.append("why, and what was tried")
+        lines = [[*line, reasons.get(line[0], "")] for line in lines]
+    return markdown(header, lines)

@@ -1,4 +1,4 @@
-"""The ops as one would write them in plain torch to be fast: no loops over points, chunks that fit the caches."""
+"""The ops in plain torch, written to be fast: no loops over points, chunks that fit into the caches."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def splat(points: Tensor, projection: Tensor, size: int, *, radius: int = 0) -> 
 
 
 def sample(points: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
-    """The visible points (B, M, 3), then padding, and how many they are."""
+    """The visible points (B, M, 3), then padding, and their number."""
     lengths = visible.sum(-1)
     order = visible.to(torch.uint8).argsort(dim=-1, descending=True, stable=True)[:, : int(lengths.max())]
     inside = torch.arange(order.shape[1]) < lengths[:, None]
@@ -102,7 +102,7 @@ def unproject_dense(depth: Tensor, camera: dp.PinholeCamera) -> tuple[Tensor, Te
 
 
 def unproject(depth: Tensor, camera: dp.PinholeCamera) -> tuple[Tensor, Tensor]:
-    """Foreground points first (B, H*W, 3), and how many they are."""
+    """Foreground points first (B, H*W, 3), and their number."""
     world, foreground = unproject_dense(depth, camera)
     order = foreground.to(torch.uint8).argsort(dim=-1, descending=True, stable=True)
     return torch.take_along_dim(world, order[:, None], 2).mT, foreground.sum(-1)

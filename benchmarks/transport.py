@@ -14,11 +14,11 @@ from unittest import mock
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch is imported
 
 import torch
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 import diffpoint as dp
 from benchmarks.inputs import pairs, surfaces
+from benchmarks.matching import exact_cost
 from benchmarks.saved import machine, save, title
 from benchmarks.tables import markdown
 from diffpoint import _bridge
@@ -39,7 +39,7 @@ HEADER = [
 
 
 def families(count: int, n: int) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """Pairs of sets (count, n, 3) as a training meets them, from its beginning to its end."""
+    """Pairs of sets (count, n, 3) as in training, from its beginning to its end."""
     yield "two shapes", surfaces(count, n, seed=5), surfaces(count, n, seed=50)
     samplings = surfaces(count, 2 * n)
     generator = torch.Generator().manual_seed(1)
@@ -50,14 +50,6 @@ def families(count: int, n: int) -> Iterator[tuple[str, Tensor, Tensor]]:
     near = surfaces(count, n, seed=7)
     moved = near + 0.005 * torch.randn(count, n, 3, generator=generator)
     yield "the same points, noise 0.005", near, moved[:, torch.randperm(n, generator=generator)].contiguous()
-
-
-def least_cost(a: Tensor, b: Tensor) -> float:
-    """By scipy, in float64: mean distance over the best assignment of two sets of equal size."""
-    difference = a.double()[:, None] - b.double()[None]
-    matrix = difference.norm(dim=-1).numpy()
-    rows, columns = linear_sum_assignment(matrix)
-    return float(matrix[rows, columns].mean())
 
 
 def measure(a: Tensor, b: Tensor, *, exact: int, runs: int) -> dict[str, Any]:
@@ -81,14 +73,13 @@ def measure(a: Tensor, b: Tensor, *, exact: int, runs: int) -> dict[str, Any]:
 
 
 def _exactness(prefix: str, result: dp.Transport, a: Tensor, b: Tensor) -> dict[str, float]:
-    least = torch.tensor([least_cost(x, y) for x, y in zip(a, b, strict=True)])
-    error = result.cost[: len(least)].double() / least - 1
+    optimal = torch.tensor([exact_cost(x, y) for x, y in zip(a, b, strict=True)])
+    error = result.cost[: len(optimal)].double() / optimal - 1
     bound = result.bound / result.cost
     return {
-        f"{prefix}error_mean": float(error.mean()),
-        f"{prefix}error_worst": float(error.max()),
-        f"{prefix}bound_mean": float(bound.mean()),
-        f"{prefix}bound_worst": float(bound.max()),
+        f"{prefix}{name}_{kind}": float(getattr(values, function)())
+        for name, values in (("error", error), ("bound", bound))
+        for kind, function in (("mean", "mean"), ("worst", "max"))
     }
 
 
@@ -147,15 +138,15 @@ def main() -> None:
         rows[name] = measure(a, b, exact=arguments.exact, runs=arguments.runs)
         print(" | ".join(line(name, rows[name])), flush=True)
     here = machine()
-    said = (
+    caption = (
         f"{title(here)}.\n\n{arguments.pairs} pairs of {arguments.points} x {arguments.points} points in one call of "
         f"`earth_mover_distance` with its default tolerance; errors of {arguments.exact} of them against scipy's exact "
-        "assignment. Bound: the excess that the result itself admits. Started: the points of the first set have moved "
-        f"by about {STEP}, and the result before is the `start`.\n\n"
+        "assignment. Bound: `Transport.bound` relative to the cost. Started: the points of the first set have moved "
+        f"by about {STEP}, and the result before that is the `start`.\n\n"
     )
     table = markdown(HEADER, [line(name, row) for name, row in rows.items()])
     path = arguments.out / "transport.json"
-    save({"machine": here, "rows": rows}, f"{said}{table}\n", path)
+    save({"machine": here, "rows": rows}, f"{caption}{table}\n", path)
     print(f"Saved {path}")
 
 

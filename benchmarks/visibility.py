@@ -1,4 +1,4 @@
-"""`python -m benchmarks.visibility`: what each method of `visible_points` shows, against ray casting, and its time.
+"""`python -m benchmarks.visibility`: accuracy of the methods of `visible_points`, against ray casting, and their times.
 
 Hidden share = hidden points among those kept; recall = kept points among the visible ones; both are means over views.
 """
@@ -19,7 +19,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch is imported
 import torch
 
 import diffpoint as dp
-from benchmarks.harness import machine
+from benchmarks.saved import machine
+from benchmarks.tables import markdown
 from benchmarks.visibility_shapes import (
     FURNITURE,
     MEASURED,
@@ -33,7 +34,7 @@ from train.experiments.runtime import COUNTS, PAPER, medians
 
 SIZES = (28, 32, 40, 56, 112, 224)
 HEADLINE = 56
-MARK = {"hidden": 0.05, "recall": 0.75, "ratio": 3.0}
+TARGET = {"hidden": 0.05, "recall": 0.75, "ratio": 3.0}
 SWEEPS: dict[Method, tuple[str, tuple[float, ...]]] = {
     "horizon": ("tolerance", (0.03, 0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5, 0.7)),
     "hpr": ("radius", (1.0, 1.25, 1.5, 1.75, 2.0, 2.5)),
@@ -74,11 +75,11 @@ def main() -> None:
         "shapes": [f"{scene.category}: {scene.name}" for scene in scenes],
         "base_hidden": {n: float(torch.cat([s.hidden[n] for s in scenes]).float().mean()) for n in COUNTS},
         "paper": PAPER,
-        "mark": MARK,
+        "target": TARGET,
         "grid": grid,
         "curves": curves,
-        "time": [row for count in COUNTS for row in times(scenes, count)],
-        "single": [row for count in COUNTS for row in single_times(scenes, count)],
+        "time": [row for count in COUNTS for row in times(scenes, count, clouds=10)],
+        "single": [row for count in COUNTS for row in times(scenes, count, clouds=1)],
         "categories": categories(scenes),
     }
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -114,39 +115,44 @@ def categories(scenes: Sequence[Scene]) -> list[dict[str, Any]]:
     ]
 
 
-def times(scenes: Sequence[Scene], count: int, clouds: int = 10) -> list[dict[str, Any]]:
-    """Processor milliseconds per cloud and view in a batch, and times the z-buffer; in turns, medians."""
+def times(scenes: Sequence[Scene], count: int, *, clouds: int) -> list[dict[str, Any]]:
+    """Milliseconds per cloud and view, and relative to the z-buffer; in turns, medians.
+
+    With `clouds` > 1 processor time in a batch of them before all of their cameras, else wall-clock time of one view.
+    """
     points = torch.stack([scene.clouds[count] for scene in scenes[:clouds]])
-    camera = dp.PinholeCamera(
-        torch.stack([scene.camera.K for scene in scenes[:clouds]]),
-        torch.stack([scene.camera.cam_from_world for scene in scenes[:clouds]]),
-        224,
-        224,
-    ).resize(HEADLINE, HEADLINE)
-    views = points.shape[0] * camera.batch_shape[1]
+    K, cam_from_world = (
+        torch.stack([getattr(scene.camera, name) for scene in scenes[:clouds]])
+        for name in ("K", "cam_from_world")
+    )
+    camera = dp.PinholeCamera(K, cam_from_world, 224, 224).resize(HEADLINE, HEADLINE)
+    if clouds == 1:
+        camera = camera[:, :1]
 
     def run(method: Method) -> Callable[[], Any]:
-        if method == "hpr":  # one cloud stands for all: it is slow, and not batched
-            return lambda: dp.visible_points(points[:1], camera[0], method=method)
-        return lambda: dp.visible_points(points, camera, method=method)
+        own = 1 if method == "hpr" else clouds  # it is slow, and not batched
+        return lambda: dp.visible_points(points[:own], camera[:own], method=method)
 
-    milliseconds = medians({m: run(m) for m in METHODS}, rounds=15, clock=time.process_time)
-    per_view = {m: ms / (camera.batch_shape[1] if m == "hpr" else views) for m, ms in milliseconds.items()}
+    milliseconds = (
+        medians({m: run(m) for m in METHODS}, rounds=31)
+        if clouds == 1
+        else medians({m: run(m) for m in METHODS}, rounds=15, clock=time.process_time)
+    )
+    views = camera.batch_shape[1]
+    per_view = {m: ms / (views if m == "hpr" else views * len(points)) for m, ms in milliseconds.items()}
     return [
         {"points": count, "method": m, "ms": ms, "ratio": ms / per_view["zbuffer"]}
         for m, ms in per_view.items()
     ]
 
 
-def single_times(scenes: Sequence[Scene], count: int) -> list[dict[str, Any]]:
-    """Milliseconds by the clock for one cloud in one view, as the paper gives them."""
-    points, camera = scenes[0].clouds[count][None], scenes[0].camera[0].resize(HEADLINE, HEADLINE)
+def _row(rows: list[dict[str, Any]], **key: Any) -> dict[str, Any]:
+    """The first row with these values; empty if there is none."""
+    return next((row for row in rows if key.items() <= row.items()), {})
 
-    def run(method: Method) -> Callable[[], Any]:
-        return lambda: dp.visible_points(points, camera, method=method)
 
-    milliseconds = medians({m: run(m) for m in METHODS}, rounds=31)
-    return [{"points": count, "method": m, "ms": ms} for m, ms in milliseconds.items()]
+def _shares(row: dict[str, Any]) -> str:
+    return f"{100 * row['hidden']:.1f} / {100 * row['recall']:.1f}" if row else "same"
 
 
 def report(result: dict[str, Any]) -> str:
@@ -160,49 +166,24 @@ def report(result: dict[str, Any]) -> str:
         "",
     ]
     for count in COUNTS:
-        lines += [
-            f"### {count} points",
-            "",
-            "| method | "
-            + " | ".join(f"{s} x {s}" for s in SIZES)
-            + " | ms per view (times z-buffer) | one cloud, ms |",
-            "|---" * (len(SIZES) + 3) + "|",
-        ]
+        header = ["method", *(f"{s} x {s}" for s in SIZES), "ms per view (times z-buffer)", "one cloud, ms"]
+        table = []
         for method in METHODS:
-            cells = []
-            for size in SIZES:
-                found = [
-                    r
-                    for r in result["grid"]
-                    if (r["points"], r["size"], r["method"]) == (count, size, method)
-                ]
-                cells.append(
-                    f"{100 * found[0]['hidden']:.1f} / {100 * found[0]['recall']:.1f}" if found else "same"
-                )
-            spent = next(r for r in result["time"] if (r["points"], r["method"]) == (count, method))
-            single = next(r for r in result["single"] if (r["points"], r["method"]) == (count, method))
-            cells += [f"{spent['ms']:.3f} ({spent['ratio']:.1f}x)", f"{single['ms']:.2f}"]
-            lines.append(f"| {method} | " + " | ".join(cells) + " |")
+            key = {"points": count, "method": method}
+            spent, single = _row(result["time"], **key), _row(result["single"], **key)
+            cells = [_shares(_row(result["grid"], size=size, **key)) for size in SIZES]
+            table.append(
+                [method, *cells, f"{spent['ms']:.3f} ({spent['ratio']:.1f}x)", f"{single['ms']:.2f}"]
+            )
         paper = PAPER[count]
-        lines += [
-            f"| the paper, on a GPU | {_percent(paper['hidden'])} hidden"
-            + " |" * len(SIZES)
-            + f" | {paper['zbuffer']} |",
-            "",
-        ]
-    lines += [
-        "### By category, 56 x 56, 2048 points",
-        "",
-        "| category | zbuffer | horizon | hpr |",
-        "|---|---|---|---|",
+        last = f"| the paper, on a GPU | {_percent(paper['hidden'])} hidden{' |' * len(SIZES)} | {paper['zbuffer']} |"
+        lines += [f"### {count} points", "", markdown(header, table), last, ""]
+    compared = ("zbuffer", "horizon", "hpr")
+    table = [
+        [name, *(_shares(_row(result["categories"], category=name, points=2048, method=m)) for m in compared)]
+        for name in dict.fromkeys(r["category"] for r in result["categories"])
     ]
-    for name in dict.fromkeys(r["category"] for r in result["categories"]):
-        row = [r for r in result["categories"] if r["category"] == name and r["points"] == COUNTS[0]]
-        lines.append(
-            f"| {name} | "
-            + " | ".join(f"{100 * r['hidden']:.1f} / {100 * r['recall']:.1f}" for r in row)
-            + " |"
-        )
+    lines += ["### By category, 56 x 56, 2048 points", "", markdown(["category", *compared], table)]
     return "\n".join(lines) + "\n"
 
 
@@ -220,24 +201,26 @@ def figure(result: dict[str, Any], path: Path) -> None:
     colours = {"zbuffer": "#777777", "horizon": "#d55e00", "hpr": "#0072b2"}
     figure, panels = pyplot.subplots(1, len(COUNTS), figsize=(12, 5.2), sharey=True)
     for panel, count in zip(panels, COUNTS, strict=True):
-        spent = {r["method"]: r for r in result["time"] if r["points"] == count}
         for method in METHODS:
-            rows = [r for r in result["curves"] if (r["points"], r["method"]) == (count, method)]
-            if method == "zbuffer":
-                rows = [r for r in result["grid"] if (r["points"], r["method"]) == (count, method)]
-            times = f"{spent[method]['ms']:.2g} ms, {spent[method]['ratio']:.1f}x"
-            label = {"zbuffer": f"zbuffer, {SIZES[0]} to {SIZES[-1]} px"}.get(method, method)
-            hidden, recall = [100 * r["hidden"] for r in rows], [100 * r["recall"] for r in rows]
-            style = "--s" if method == "zbuffer" else "-o"
-            panel.plot(hidden, recall, style, color=colours[method], markersize=4, label=f"{label} ({times})")
-            default = next(
-                r
-                for r in result["grid"]
-                if (r["points"], r["method"], r["size"]) == (count, method, HEADLINE)
-            )
-            panel.plot(
-                100 * default["hidden"], 100 * default["recall"], "o", color=colours[method], markersize=10
-            )
+            key = {"points": count, "method": method}
+            source = result["grid" if method == "zbuffer" else "curves"]
+            rows = [r for r in source if key.items() <= r.items()]
+            spent, default = _row(result["time"], **key), _row(result["grid"], size=HEADLINE, **key)
+            name = f"zbuffer, {SIZES[0]} to {SIZES[-1]} px" if method == "zbuffer" else method
+            label = f"{name} ({spent['ms']:.2g} ms, {spent['ratio']:.1f}x)"
+            for points, style, size in (
+                (rows, "--s" if method == "zbuffer" else "-o", 4),
+                ([default], "o", 10),
+            ):
+                hidden, recall = ([100 * r[share] for r in points] for share in ("hidden", "recall"))
+                panel.plot(
+                    hidden,
+                    recall,
+                    style,
+                    color=colours[method],
+                    markersize=size,
+                    label=label if size == 4 else None,
+                )
         panel.axvline(100 * PAPER[count]["hidden"], color="#aaaaaa", linestyle=":", linewidth=1)
         panel.annotate(
             f"the paper: {_percent(PAPER[count]['hidden'])}",
@@ -247,9 +230,9 @@ def figure(result: dict[str, Any], path: Path) -> None:
         )
         if count == COUNTS[0]:
             panel.fill_between(
-                [0, 100 * MARK["hidden"]], 100 * MARK["recall"], 100, color="#2ca02c", alpha=0.12
+                [0, 100 * TARGET["hidden"]], 100 * TARGET["recall"], 100, color="#2ca02c", alpha=0.12
             )
-            panel.annotate("the mark", (0.3, 96), fontsize=8, color="#2ca02c")
+            panel.annotate("target", (0.3, 96), fontsize=8, color="#2ca02c")
         panel.set(
             title=f"{count} points, {HEADLINE} x {HEADLINE} map", xlabel="hidden share of what is kept, %"
         )

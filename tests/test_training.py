@@ -235,7 +235,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_it_can_be_resumed(
 def test_a_run_of_an_earlier_version_is_evaluated_and_resumed(
     tiny_data: Path, smoke_run: Path, train_split: LoadedSplit, tmp_path: Path
 ) -> None:
-    """The names of version 0.9: of settings in config.json and weights, and of the state's failed checks."""
+    """With the old names of settings, in config.json and in weights, and of the count of failed collapse checks."""
     run = _copy_at_60(smoke_run, tmp_path / "run")
     config = (run / "config.json").read_text()
     for new, old in (
@@ -274,20 +274,6 @@ def test_resuming_with_other_data_is_refused(tiny_data: Path, smoke_run: Path) -
     split = load_split(tiny_data, "test", image_size=(48, 64), map_size=16, progress=False)
     with pytest.raises(UserError, match="other data"):
         Trainer(_SMOKE, split).resume(smoke_run, _newest(smoke_run))
-
-
-@pytest.mark.parametrize(
-    ("resume", "change", "complaint"),
-    [
-        (False, {}, "already holds a run"),
-        (True, {"seed": 1, "map_size": 8}, "other values of map_size, seed"),
-    ],
-)
-def test_runs_are_neither_overwritten_nor_mixed(
-    resume: bool, change: dict[str, int], complaint: str, tiny_data: Path, smoke_run: Path
-) -> None:
-    with pytest.raises(UserError, match=complaint):
-        fit(tiny_data, smoke_run, dataclasses.replace(_SMOKE, **change), resume=resume, progress=False)
 
 
 # --- phases, where they start, what they keep
@@ -459,22 +445,10 @@ def test_the_newest_two_checkpoints_are_kept_and_a_damaged_one_is_named(tmp_path
         load_networks(newest, networks)
 
 
-def test_what_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
-    (tmp_path / "noise.safetensors").write_bytes(b"\x00" * 100)
+def test_weights_of_another_program_or_version_are_called_so(tmp_path: Path) -> None:
     save_file({"a": torch.zeros(1)}, tmp_path / "other.safetensors")
-    (tmp_path / "empty").mkdir()
-    for name, complaint in (
-        ("missing", "does not exist"),
-        ("empty", "is not a run"),
-        ("noise.safetensors", "holds no generator's weights"),
-        ("other.safetensors", "no diffpoint.generator header"),
-    ):
-        with pytest.raises(UserError, match=complaint) as caught:
-            load_generator(tmp_path / name)
-        assert name in str(caught.value)
-
-
-def test_weights_of_another_version_are_called_so(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"other\.safetensors .*no diffpoint.generator header"):
+        load_generator(tmp_path / "other.safetensors")
     path = tmp_path / "old.safetensors"
     save_weights(build_generator("smoke"), path)
     with safe_open(path, framework="pt") as file:

@@ -1,4 +1,4 @@
-"""The demo: data, training, evaluation, reconstruction and a report, through the functions of the commands."""
+"""The demo: data, training, evaluation, reconstruction and a report, with the functions behind the commands."""
 
 from __future__ import annotations
 
@@ -13,38 +13,44 @@ from train.data import ShapeTree
 from train.data.procedural import generate
 from train.data.tree_files import render_folder
 from train.evaluation.evaluate import evaluate
+from train.evaluation.examples import report_run
 from train.evaluation.reconstruct import reconstruct_to_files
-from train.evaluation.report import write_report
 from train.evaluation.runs import best_weights
 from train.files import write_text
 from train.methods import recipe
 from train.training.trainer import fit
 
-# Two fifths of the profile's steps: about six minutes on two cores, and past the point where more views help.
+# Two fifths of the profile's steps: about six minutes on two cores, and enough for more views to lower the error.
 DEMO_CONFIG = scaled(recipe("ours", "cpu"), 0.4)
 _RENDER_SIZE = 112
-_CATEGORIES = ("chair", "display")  # two that so short a training can learn
+_CATEGORIES = ("chair", "display")  # learnt in so short a training
 
 
 def demo(
-    out: Path, *, shapes: int = 400, seed: int = 0, config: FitConfig = DEMO_CONFIG, progress: bool = True
+    out: str | Path,
+    *,
+    shapes: int = 400,
+    seed: int = 0,
+    config: FitConfig = DEMO_CONFIG,
+    progress: bool = True,
 ) -> Path:
     """Runs the whole chain on generated shapes; a second call continues where the first was stopped.
 
     Args:
-        out: directory of everything: data/, run/, reconstruction/, figures/ and report.html.
-        shapes: generated chairs and displays, over all splits.
+        out: directory to write to: data/, run/, reconstruction/, figures/ and report.html.
+        shapes: number of generated chairs and displays in all splits together.
         seed: of data and examples.
-        config: how to train.
-        progress: show bars.
+        config: the training's configuration.
+        progress: show progress bars.
 
     Returns:
         The report, out/report.html.
 
     Raises:
-        UserError: `out` holds a demo with other settings, or something that is none.
-        KeyboardInterrupt: training was stopped; it has saved its state.
+        UserError: `out` holds a demo with other settings, or other files.
+        KeyboardInterrupt: training was stopped, after it saved its state.
     """
+    out = Path(out)
     data, run = out / "data", out / "run"
     clock = _Clock(out / "times.json")
 
@@ -56,25 +62,26 @@ def demo(
         if not finished:
             raise KeyboardInterrupt
 
-    with clock.phase("evaluation", "3/5 scoring on shapes that were kept out of training"):
+    with clock.phase("evaluation", "3/5 evaluation on shapes that were not used for training"):
         if not _up_to_date(run):
             evaluate(run, data, progress=progress)
 
     test = ShapeTree(data, "test")
     images = sorted(render_folder(data, test.ids[0]).glob("render_*.png"))
     with clock.phase(
-        "reconstruction", f"4/5 one of them from its {len(images)} images -> {out / 'reconstruction'}"
+        "reconstruction",
+        f"4/5 reconstruction of one of them from {len(images)} images -> {out / 'reconstruction'}",
     ):
         reconstruct_to_files(run, images, out / "reconstruction", seed=seed)
 
     with clock.phase("report", "5/5 the report"):
-        page = write_report(out, run=run, data=data, seconds=clock.seconds, seed=seed)
+        page = report_run(out, run=run, data=data, seconds=clock.seconds, seed=seed)
     print(f"\nDone in {sum(clock.seconds.values()) / 60:.1f} minutes. Open {page} in a browser.")
     return page
 
 
 class _Clock:
-    """Seconds that each phase took until it was first finished, over all calls of the demo."""
+    """Duration of each phase in seconds, until it was first finished, summed over all calls of the demo."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -99,6 +106,6 @@ class _Clock:
 
 
 def _up_to_date(run: Path) -> bool:
-    """Was the run evaluated after its last weights were written?"""
+    """Whether the run was evaluated after its last weights were written."""
     evaluation = run / "evaluation.json"
     return evaluation.exists() and evaluation.stat().st_mtime >= best_weights(run, 2).stat().st_mtime

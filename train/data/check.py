@@ -214,7 +214,7 @@ def _text(value) -> str:
 
 
 def _changed_frame(root: Path, shapes: list[str]) -> Frame:
-    """The frame of a tree that this program made and in which most shapes are inconsistent: somebody changed it."""
+    """The frame of a tree that this program made and in which most shapes are inconsistent: it was changed since."""
     found = find_frame(sample_shapes(layout_of(root), shapes))
     if not found.settled or not found.changes:
         return dataclasses.replace(AS_IT_IS, verdict=found.verdict, settled=found.settled)

@@ -222,7 +222,7 @@ def _read_unturned(layout: Layout, shape: str) -> Shape:
 
 
 def _missing(layout: Layout, shape: str) -> str | None:
-    """Why a shape that a list names cannot be read, as far as names tell; None if its files are there."""
+    """Why a shape of a list has no files; None if it has."""
     if not is_shape_id(shape):
         return (
             f"{shape}: not of the form <synset>/<model>, as the lines of the lists in {layout.root} must be"

@@ -46,7 +46,7 @@ from train.evaluation.retrieval import medoid, nearest_by_image
 from train.evaluation.runs import open_run
 from train.evaluation.sensitivity import sensitivity
 from train.files import write_text
-from train.show.table import format_table
+from train.show.summary import format_result
 
 VIEW_COUNTS = (1, 2, 4, 8)
 _DIVERSITY_CODES = 10
@@ -114,7 +114,7 @@ def evaluate(
     }
     write_text(Path(out), json.dumps(result, indent=2) + "\n")
     if progress:
-        print(format_table(result))
+        print(format_result(result))
         print(f"took {time.monotonic() - begun:.0f} s; wrote {out}")
     return result
 

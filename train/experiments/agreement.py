@@ -30,13 +30,13 @@ from train.evaluation.per_shape import METRICS, evaluate_split
 from train.evaluation.runs import open_run
 from train.experiments.correlation import pearson
 from train.experiments.frame import Experiment, Outcome
-from train.experiments.markdown import table_lines
 from train.experiments.statistics import spreads, stacked
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
 from train.experiments.table import NAMES
 from train.processes import progress_bar
 from train.show import figures
+from train.show.tables import markdown_lines
 
 _RANDOM = "random codes"
 SETTINGS: dict[str, InferenceConfig] = {
@@ -222,7 +222,9 @@ def markdown(result: Mapping[str, Any]) -> str:
         for name, r in result["correlation"].items()
     ]
     question = ["correlation of consistency loss with", "over groups of codes, within a shape", "over shapes"]
-    return "\n".join([head, "", *table_lines(titles, rows), "", *table_lines(question, correlations), ""])
+    return "\n".join(
+        [head, "", *markdown_lines(titles, rows), "", *markdown_lines(question, correlations), ""]
+    )
 
 
 def _figure(result: Mapping[str, Any], groups: Mapping[str, np.ndarray]) -> Figure:

@@ -26,13 +26,13 @@ from train.errors import UserError
 from train.evaluation.runs import read_split
 from train.evaluation.sensitivity import sensitivity
 from train.experiments.frame import Experiment, Outcome
-from train.experiments.markdown import table_lines
 from train.experiments.paper import without_critic
 from train.experiments.study import Study, stage1_of
 from train.files import kept
 from train.methods import get_method, recipe
 from train.processes import progress_bar
 from train.show import figures
+from train.show.tables import markdown_lines
 from train.training.trainer import Trainer
 from train.training.validation import validate
 
@@ -197,7 +197,7 @@ def markdown(result: Mapping[str, Any]) -> str:
             [name, *(" / ".join(f"{value:.2f}" for value in row[column]) for column in _COLUMNS)]
             for name, row in rows.items()
         ]
-        lines += ["", *table_lines([tree, *_COLUMNS.values()], cells)]
+        lines += ["", *markdown_lines([tree, *_COLUMNS.values()], cells)]
     return "\n".join([*lines, ""])
 
 

@@ -16,12 +16,12 @@ from scipy.stats import rankdata
 
 from train.config import InferenceConfig
 from train.experiments.frame import Experiment, Outcome
-from train.experiments.markdown import table_lines
 from train.experiments.statistics import LEVEL, claim, interval, resampled_means, spread, stacked, trainings
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
 from train.experiments.table import NAMES
 from train.show import figures
+from train.show.tables import markdown_lines
 
 VIEWS = 8
 GROUPS = 20
@@ -160,7 +160,7 @@ def markdown(result: Mapping[str, Any]) -> str:
         for question, words in _WORDS.items()
         for error in _ERRORS
     ]
-    return "\n".join([head, "", *table_lines(["", "Pearson", "Spearman"], rows), ""])
+    return "\n".join([head, "", *markdown_lines(["", "Pearson", "Spearman"], rows), ""])
 
 
 def _cell(found: Mapping[str, Any]) -> str:

@@ -27,7 +27,6 @@ from train.data.render import Renderer, orbit_camera
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
 from train.experiments.frame import Experiment, Outcome
-from train.experiments.markdown import table_lines
 from train.experiments.paper import highly_diverse, without_codes
 from train.experiments.statistics import (
     claim,
@@ -42,6 +41,7 @@ from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, unchanged
 from train.processes import progress_bar
 from train.show import figures
+from train.show.tables import markdown_lines
 
 CODES = (10, 50)
 APART = 0.04
@@ -334,12 +334,12 @@ def markdown(result: Mapping[str, Any]) -> str:
         ]
         for family, found in result["categories"].items()
     ]
-    lines = [head, "", *table_lines(["", *_COLUMNS.values()], rows), "", *claim_lines(result["claims"])]
+    lines = [head, "", *markdown_lines(["", *_COLUMNS.values()], rows), "", *claim_lines(result["claims"])]
     lines += [
         "",
         "Backs reached / predictions close to none, by family:",
         "",
-        *table_lines(["", *names], by_category),
+        *markdown_lines(["", *names], by_category),
     ]
     return "\n".join([*lines, ""])
 

@@ -9,10 +9,10 @@ from typing import Any
 
 from train.errors import UserError
 from train.experiments import store
-from train.experiments.markdown import table_lines
 from train.experiments.registry import EXPERIMENTS
 from train.experiments.statistics import CLAIM_ALIGNMENT, CLAIM_COLUMNS, LEVEL, claim_cells, counted
 from train.files import write_text
+from train.show.tables import markdown_lines
 
 
 def write_page(out: Path) -> Path:
@@ -81,7 +81,7 @@ def _summary(groups: Mapping[Path, Mapping[str, Mapping[str, Any]]]) -> list[str
         "one way or the other. A gain without an interval is of an experiment whose metrics per shape are not kept "
         "here."
     )
-    return [words, "", *table_lines(head, rows, "l" * (len(head) - len(CLAIM_COLUMNS)) + CLAIM_ALIGNMENT)]
+    return [words, "", *markdown_lines(head, rows, "l" * (len(head) - len(CLAIM_COLUMNS)) + CLAIM_ALIGNMENT)]
 
 
 def _section(folder: Path, name: str, result: Mapping[str, Any], beside: Path) -> str:

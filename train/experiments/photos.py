@@ -26,11 +26,11 @@ from train.errors import UserError
 from train.evaluation.inference import reconstruct
 from train.evaluation.reconstruct import MOST_IMAGES, read_pictures
 from train.experiments.frame import Experiment, Outcome
-from train.experiments.markdown import table_lines
 from train.experiments.statistics import spread, trainings
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
 from train.show import figures
+from train.show.tables import markdown_lines
 
 OBJECTS = 8
 CODES = 3
@@ -163,7 +163,7 @@ def markdown(result: Mapping[str, Any]) -> str:
         [name, str(each["pictures"]), *(f"{each[step]['mean']:.2f}" if each[step] else "" for step in _STEPS)]
         for name, each in result["objects"].items()
     ]
-    lines = [head, "", *table_lines(["", "pictures", *_STEPS], rows), ""]
+    lines = [head, "", *markdown_lines(["", "pictures", *_STEPS], rows), ""]
     if result["left_out"]:
         lines += ["Left out:", "", *(f"- {title}: {why}" for title, why in result["left_out"].items()), ""]
     return "\n".join(lines)

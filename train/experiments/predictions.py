@@ -11,17 +11,17 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from diffpoint import PinholeCamera, nearest, visible_points
-from models import Generator, Predictor
+from models import Predictor
 from train.data import ShapeTree
 from train.data.batches import LoadedSplit
+from train.evaluation.examples import make_example, pick_shapes
 from train.evaluation.per_shape import concatenate, sample_predictions
-from train.evaluation.report import make_example, pick_shapes
 from train.experiments.frame import Experiment, Outcome
-from train.experiments.markdown import table_lines
 from train.experiments.statistics import claim, spreads, stacked, trainings
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
 from train.show import figures
+from train.show.tables import markdown_lines
 
 CODES = 6
 SHOWN_CODES, SHOWN_SHAPES = 5, 6
@@ -125,14 +125,13 @@ def markdown(result: Mapping[str, Any]) -> str:
         for name, row in {"all": result["all"], **result["categories"]}.items()
     ]
     columns = ["", "shapes", "front", "back", "back / front, by seed", "of the surface"]
-    return "\n".join([head, "", *table_lines(columns, rows), ""])
+    return "\n".join([head, "", *markdown_lines(columns, rows), ""])
 
 
 def _figure(study: Study) -> Figure:
     config = study.config(unchanged, seed=0)
     tree = ShapeTree(study.test_tree, "test", list(config.categories) or None)
     model = study.network(config)
-    assert isinstance(model, Generator)
     examples = [
         make_example(model, shape, config, seed=0, codes=SHOWN_CODES)
         for shape in pick_shapes(tree, SHOWN_SHAPES)

@@ -18,10 +18,10 @@ from train.evaluation.inference import reconstruct
 from train.evaluation.metrics import cloud_errors, thin_out
 from train.evaluation.per_shape import view_order
 from train.experiments.frame import Experiment, Outcome
-from train.experiments.markdown import table_lines
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, of_method, unchanged
 from train.show import figures
+from train.show.tables import markdown_lines
 
 VIEWS = 8
 """Images of a shape, where the data have as many."""
@@ -123,7 +123,7 @@ def markdown(result: Mapping[str, Any]) -> str:
 
     rows = [[f"{each['category']} `{shape}`", *cells(each)] for shape, each in result["shapes"].items()]
     rows.append(["mean", *cells(result["mean"])])
-    return "\n".join([head, "", *table_lines(["", *names], rows), ""])
+    return "\n".join([head, "", *markdown_lines(["", *names], rows), ""])
 
 
 def _figure(

@@ -24,12 +24,12 @@ from train.data.families import FAMILIES
 from train.data.render import Orbit
 from train.experiments.frame import Experiment, Outcome
 from train.experiments.hidden_points import EPSILON, VIEWS, Scene, embedded_scene, quality
-from train.experiments.markdown import table_lines
 from train.experiments.statistics import claim, claim_lines
 from train.experiments.study import Study
 from train.files import kept
 from train.processes import progress_bar
 from train.show import figures
+from train.show.tables import markdown_lines
 
 PAPER = {
     2048: {"hidden": 0.104, "zbuffer": 6.6, "triangulation": 209.8},
@@ -202,7 +202,7 @@ def markdown(result: Mapping[str, Any]) -> str:
             theirs = hidden[base["points"]] if method == "zbuffer" else ""
             title = f"{name}, {_points(base)}, eps {base['epsilon']}"
             shares.append([title, *cells, f"{base['hidden']:.1%}", theirs])
-    lines = [head, "", how, "", *table_lines(["", "z-buffer", "horizon", "triangulation", _RATIO], times)]
+    lines = [head, "", how, "", *markdown_lines(["", "z-buffer", "horizon", "triangulation", _RATIO], times)]
     lines += ["", *claim_lines(result["claims"])]
     lines += [
         "",
@@ -210,7 +210,7 @@ def markdown(result: Mapping[str, Any]) -> str:
         "",
     ]
     sides = [f"{side} x {side}" for side in result["sides"]]
-    lines += table_lines(["", *sides, "hidden of all", "paper, hidden"], shares)
+    lines += markdown_lines(["", *sides, "hidden of all", "paper, hidden"], shares)
     return "\n".join([*lines, "", _summary(result), ""])
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from train.experiments.markdown import table_lines
 from train.experiments.store import Metrics
+from train.show.tables import markdown_lines
 
 LEVEL = 0.95
 """Of all intervals."""
@@ -130,7 +130,7 @@ def claim_cells(found: Mapping[str, Any]) -> list[str]:
 
 def claim_lines(claims: Iterable[Mapping[str, Any]]) -> list[str]:
     """A Markdown table of claims."""
-    return table_lines(CLAIM_COLUMNS, map(claim_cells, claims), CLAIM_ALIGNMENT)
+    return markdown_lines(CLAIM_COLUMNS, map(claim_cells, claims), CLAIM_ALIGNMENT)
 
 
 def counted(claims: Iterable[Mapping[str, Any]]) -> str:

@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 
 from train.config import FitConfig, InferenceConfig, scaled
 from train.experiments.frame import Experiment, Outcome
-from train.experiments.markdown import table_lines
 from train.experiments.statistics import claim, claim_lines, spread_text, stacked, trainings
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Split, Study, stage1_of, unchanged
 from train.show import figures
+from train.show.tables import markdown_lines
 
 NAMES = {
     "gt_to_pred": "GT->pred",
@@ -299,7 +299,7 @@ def markdown(result: Mapping[str, Any]) -> str:
         f"In brackets: the paper.{_ABOUT_THE_CRITIC if 'critic' in columns else ''}"
     )
     rows = [[name, *(_cell(row, column) for column in columns)] for name, row in result["rows"].items()]
-    lines = [head, "", *table_lines(["", *(NAMES[name] for name in columns)], rows)]
+    lines = [head, "", *markdown_lines(["", *(NAMES[name] for name in columns)], rows)]
     if "categories" in result:
         lines += ["", *_category_lines(result)]
     if result["claims"]:
@@ -345,7 +345,11 @@ def _category_lines(result: Mapping[str, Any]) -> list[str]:
     lines.append(["mean over categories", "", *cells(of_categories), ""])
     words = "; ".join(claim["words"] for claim in next(iter(found.values()))["claims"])
     head = f"CD (FPS-CD) by category, and the verdicts on these claims there: {words}."
-    return [head, "", *table_lines(["", "shapes", *names, "verdicts"], lines, "lr" + "r" * len(names) + "l")]
+    return [
+        head,
+        "",
+        *markdown_lines(["", "shapes", *names, "verdicts"], lines, "lr" + "r" * len(names) + "l"),
+    ]
 
 
 def figure(result: Mapping[str, Any]) -> Figure:

@@ -1,13 +1,13 @@
-"""Pictures of clouds and of a run's curves, as matplotlib figures that belong to no window.
+"""Matplotlib figures of point clouds, of a run's curves and of errors.
 
-Nothing here touches pyplot's global state; `save` writes a figure. Clouds are seen through a camera in
-perspective: near points are dark and large, far ones pale and small.
+Pyplot's global state is not used; `save` writes a figure. Clouds are drawn in perspective: near points are dark and
+large, far ones pale and small.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,40 +25,40 @@ PREDICTED = LinearSegmentedColormap.from_list("predicted", ["#0b2545", "#1f6f8b"
 TRUE = LinearSegmentedColormap.from_list("true", ["#3d1f0c", "#a4562a", "#dd9f63", "#f6e3c5"])
 MUTED = "#6b7785"
 _CELL_INCHES = 2.1
-_DEPTH_RANGE = 0.45  # world units before and behind the origin over which a cloud fades
-_INK = 17_000  # square points of ink that a cloud's markers have together, in a cell
+_DEPTH_RANGE = 0.45  # world units before and behind the origin over which the colour changes
+_INK = 17_000  # total area of a cloud's markers in a cell, in square typographic points
 
 
 class Example(NamedTuple):
-    """One test shape and what a generator made of it."""
+    """One test shape with predictions and a reconstruction."""
 
     images: Tensor
-    """(V, 3, H, W) all views, in [0, 1], of the cameras' size."""
+    """(V, 3, H, W) all views in [0, 1], with the cameras' height and width."""
     camera: PinholeCamera
-    """(V,) their cameras."""
+    """(V,) the views' cameras."""
     chosen: int
-    """The view that the predictions were made from."""
+    """Index of the input view of the predictions."""
     predictions: Tensor
-    """(R, N, 3) clouds from that one view and R codes."""
+    """(R, N, 3) predictions from that view with R codes."""
     reconstruction: Tensor
-    """(M, 3) from all views."""
+    """(M, 3) reconstruction from all views."""
     truth: Tensor
-    """(P, 3)."""
+    """(P, 3) ground truth."""
 
     @property
     def sides(self) -> tuple[PinholeCamera, PinholeCamera]:
-        """The chosen view's camera, and the same from behind."""
+        """The chosen view's camera, and the one on the opposite side."""
         return self.camera[self.chosen], from_behind(self.camera[self.chosen])
 
 
 def from_behind(camera: PinholeCamera) -> PinholeCamera:
-    """The camera after half a turn around the world's vertical axis: the same height, the other side."""
+    """The camera after half a turn around the world's vertical axis: the same height, the opposite side."""
     half_turn = torch.diag(camera.cam_from_world.new_tensor([-1.0, 1.0, -1.0, 1.0]))
     return PinholeCamera(camera.K, camera.cam_from_world @ half_turn, camera.height, camera.width)
 
 
 def close_up(images: Tensor, camera: PinholeCamera, points: Tensor) -> tuple[Tensor, PinholeCamera]:
-    """Cuts the same margin off all of an object's images, so that it fills them; cameras follow.
+    """Crops all images of an object by the same margin, so that it fills them, and adapts the cameras.
 
     Args:
         images: (V, 3, H, W).
@@ -71,7 +71,7 @@ def close_up(images: Tensor, camera: PinholeCamera, points: Tensor) -> tuple[Ten
 
 
 def narrowed(camera: PinholeCamera, points: Tensor) -> PinholeCamera:
-    """Cameras (V,) without the margin that none of them needs to show points (P, 3)."""
+    """Cameras (V,), cropped by the largest margin with which all of them still show points (P, 3)."""
     size = points.new_tensor([camera.width, camera.height])
     away = (project(points[None], camera).pixels / size - 0.5).abs().max().item()
     share = max(0.0, 0.5 - 1.15 * away)
@@ -85,7 +85,7 @@ def narrowed(camera: PinholeCamera, points: Tensor) -> PinholeCamera:
 def draw_cloud(
     axes: Axes, points: Tensor, camera: PinholeCamera, *, colours: LinearSegmentedColormap = PREDICTED
 ) -> None:
-    """Draws a cloud (N, 3) as a single camera sees it; the axes show the camera's whole frame."""
+    """Draws a cloud (N, 3) in the view of a single camera; the axes show the whole image plane."""
     projected = project(points[None], camera)
     pixels, depth = projected.pixels[0, 0], projected.depth[0, 0]
     order = depth.argsort(descending=True)
@@ -102,14 +102,14 @@ def draw_cloud(
 
 
 def draw_image(axes: Axes, image: Tensor) -> None:
-    """Shows an image (3, H, W) in [0, 1], framed."""
+    """Draws an image (3, H, W) in [0, 1] with a frame."""
     axes.imshow(image.permute(1, 2, 0).numpy(), interpolation="antialiased")
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_color("#d5dbe1")
 
 
 def mosaic(images: Tensor) -> Tensor:
-    """(V, 3, H, W) -> (3, rows * H, columns * W), as square as can be; what is left over stays white."""
+    """(V, 3, H, W) -> (3, rows * H, columns * W), as square as possible; empty cells are white."""
     columns = math.ceil(math.sqrt(len(images)))
     blank = images.new_ones(-len(images) % columns, *images.shape[1:])
     grid = torch.cat((images, blank)).unflatten(0, (-1, columns))
@@ -117,7 +117,7 @@ def mosaic(images: Tensor) -> Tensor:
 
 
 def predictions_figure(*examples: Example) -> Figure:
-    """An image, several shapes it could be, the true one; seen from the image's side, and from behind.
+    """An image, predictions with several codes, the true shape; from the image's side and from behind.
 
     Args:
         examples: one or more, with the same number of predictions; each takes two rows.
@@ -137,7 +137,7 @@ def predictions_figure(*examples: Example) -> Figure:
 
 
 def reconstruction_figure(example: Example) -> Figure:
-    """All views of a shape, what was found from them, and the true shape; from one side and from behind."""
+    """All views of a shape, its reconstruction, and the true shape; from one side and from behind."""
     figure, panels = grid(rows=1, columns=5)
     draw_image(panels[0, 0], mosaic(example.images))
     for axes, camera in zip(panels[0, 1:3], example.sides, strict=True):
@@ -152,7 +152,7 @@ def reconstruction_figure(example: Example) -> Figure:
 
 
 def overview_figure(examples: Sequence[Example]) -> Figure:
-    """What the system does, in one picture: image, shapes it could be, the one that all images agree on, truth."""
+    """The whole system in one figure: image, predictions, reconstruction from all images, true shape."""
     count, views = len(examples[0].predictions), len(examples[0].images)
     figure, panels = grid(rows=2 * len(examples), columns=count + 3)
     for example, (upper, lower) in zip(examples, panels.reshape(len(examples), 2, -1), strict=True):
@@ -169,49 +169,47 @@ def overview_figure(examples: Sequence[Example]) -> Figure:
     return figure
 
 
-def curves_figure(records: Sequence[dict[str, Any]]) -> Figure:
-    """A run's losses, validation errors and health over its steps, from the records of metrics.jsonl."""
+def curves_figure(records: Sequence[Mapping[str, Any]]) -> Figure:
+    """A run's losses, validation errors and collapse checks over its steps, from the records of metrics.jsonl."""
     figure = Figure(figsize=(17, 6.6), layout="constrained", dpi=110)
     panels = np.asarray(figure.subplots(2, 4)).ravel()
     stages = [[record for record in records if record.get("stage") == stage] for stage in (1, 2)]
     for axes, stage, what in zip(panels[:2], stages, ("each view alone", "views joined"), strict=True):
         _curves(axes, stage, {"front": "front constraint"})
-        axes.set_title(f"Stage {1 if stage is stages[0] else 2}, {what}: does the visible side fit?")
+        axes.set_title(f"Stage {1 if stage is stages[0] else 2}, {what}: front constraint")
     panels[0].set_ylabel("front constraint (EMD, sum)")
     panels[1].set_ylabel("front constraint (chamfer x100)")
     _curves(panels[2], records, {"diversity": "diversity loss"})
-    panels[2].set(title="Do different codes give different shapes?", ylabel="diversity loss")
+    panels[2].set(title="Diversity of shapes over codes", ylabel="diversity loss")
     _curves(
         panels[3],
         records,
         {"val_cd_1": "one view", "val_cd": "all views joined", "val_fps_cd": "all views, thinned"},
     )
-    panels[3].set(title="Error on shapes not trained on", ylabel="chamfer distance x100", ylim=(0, None))
+    panels[3].set(title="Error on validation shapes", ylabel="chamfer distance x100", ylim=(0, None))
     _curves(panels[4], records, {"image_sensitivity": "with the image", "code_sensitivity": "with the code"})
-    panels[4].set(title="How far predictions move", ylabel="chamfer distance x100", ylim=(0, None))
-    _curves(panels[5], records, {"dead_share": "silent channels"})
-    panels[5].set(title="How much of the image trunk is silent?", ylabel="share", ylim=(-0.02, 1.02))
-    judged = [
-        {"step": record["step"], "ahead": record["fake_score"] - record["real_score"]}
+    panels[4].set(title="Change of predictions", ylabel="chamfer distance x100", ylim=(0, None))
+    _curves(panels[5], records, {"dead_share": "dead channels"})
+    panels[5].set(title="Dead channels of the image trunk", ylabel="share", ylim=(-0.02, 1.02))
+    scores = [
+        {"step": record["step"], "difference": record["fake_score"] - record["real_score"]}
         for record in records
         if "fake_score" in record
     ]
-    _curves(panels[6], judged, {"ahead": "predictions"})
+    _curves(panels[6], scores, {"difference": "predictions"})
     panels[6].axhline(0, color=MUTED, lw=0.8)
-    panels[6].set(title="Can the critic tell predictions?", ylabel="their score - that of real shapes")
+    panels[6].set(title="Critic: predictions against real shapes", ylabel="difference of scores")
     pretraining = [record for record in records if record.get("stage") == 0]
-    _curves(panels[7], pretraining, {"cd": "trained on", "val_autoencoder_cd": "not trained on"})
-    panels[7].set(
-        title="Auto-encoder: what is lost in a code?", ylabel="chamfer distance x100", ylim=(0, None)
-    )
+    _curves(panels[7], pretraining, {"cd": "training shapes", "val_autoencoder_cd": "validation shapes"})
+    panels[7].set(title="Auto-encoder: reconstruction error", ylabel="chamfer distance x100", ylim=(0, None))
     if stages[0] and stages[1]:
         for axes in panels[2:7]:
             axes.axvline(stages[0][-1]["step"], color=MUTED, lw=0.8, ls="--")
     return figure
 
 
-def errors_figure(result: dict[str, Any]) -> Figure:
-    """The error by number of images, beside answers without a network; from what `evaluate` returns."""
+def errors_figure(result: Mapping[str, Any]) -> Figure:
+    """The error by number of images, beside the retrieval baselines; from the result of `evaluate`."""
     figure = Figure(figsize=(7.5, 4.2), layout="constrained", dpi=110)
     axes = figure.subplots()
     for label, rows, style in (
@@ -225,7 +223,7 @@ def errors_figure(result: dict[str, Any]) -> Figure:
         axes.plot(
             [int(n) for n in rows], [row["cd"] for row in rows.values()], style, color=colour, label=label
         )
-    axes.axhline(result["medoid"]["cd"], color=MUTED, ls=":", label="most typical training shape (medoid)")
+    axes.axhline(result["medoid"]["cd"], color=MUTED, ls=":", label="medoid of the training shapes")
     counts = [int(n) for n in result["views"]]
     axes.set_xscale("log", base=2)
     axes.set_xticks(counts, [str(n) for n in counts])
@@ -243,7 +241,7 @@ def save(figure: Figure, path: str | Path) -> None:
 
 
 def grid(*, rows: int, columns: int) -> tuple[Figure, np.ndarray]:
-    """A figure of square cells, tightly set, with room for titles above and labels to the left."""
+    """A figure of square cells with narrow gaps, and with space for titles at the top."""
     width, height = columns * _CELL_INCHES + 0.1, rows * _CELL_INCHES + 0.4
     figure = Figure(figsize=(width, height), dpi=110)
     panels = figure.subplots(rows, columns, squeeze=False)
@@ -253,13 +251,13 @@ def grid(*, rows: int, columns: int) -> tuple[Figure, np.ndarray]:
 
 
 def titles(panels: np.ndarray, words: Sequence[str]) -> None:
-    """Heads the columns of a `grid`."""
+    """Sets the titles of a `grid`'s columns."""
     for axes, title in zip(panels[0], words, strict=True):
         axes.set_title(title, fontsize=11)
 
 
 def headline(figure: Figure, words: str) -> None:
-    """Gives a `figures.grid` a line above the titles of its columns."""
+    """Adds a line of text above the column titles of a `grid`."""
     width, height = figure.get_size_inches()
     figure.set_size_inches(width, height + 0.3)
     bottom, top = figure.subplotpars.bottom, figure.subplotpars.top
@@ -268,7 +266,7 @@ def headline(figure: Figure, words: str) -> None:
 
 
 def caption(axes: Axes, words: str) -> None:
-    """Writes a line at the foot of a cell, legible on whatever is drawn there."""
+    """Writes a line at the bottom of a cell, on a translucent white background."""
     behind = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
     where = {"transform": axes.transAxes, "ha": "center", "fontsize": 8, "color": MUTED}
     axes.text(0.5, 0.01, words, bbox=behind, **where)
@@ -279,8 +277,8 @@ def _sides(upper_and_lower: Sequence[Axes] | np.ndarray) -> None:
         axes.text(0, 0.5, side, transform=axes.transAxes, fontsize=8, color=MUTED, rotation=90, va="center")
 
 
-def _curves(axes: Axes, records: Sequence[dict[str, Any]], names: dict[str, str]) -> None:
-    """One line for each figure, over the records that have it; noisy ones with their running mean."""
+def _curves(axes: Axes, records: Sequence[Mapping[str, Any]], names: Mapping[str, str]) -> None:
+    """One line for each metric, over the records that have it; long ones are drawn with their running mean."""
     for (name, label), colour in zip(names.items(), ("#1f6f8b", "#c8553d", "#8a6d9e"), strict=False):
         found = [(record["step"], record[name]) for record in records if record.get(name) is not None]
         if not found:
@@ -300,18 +298,18 @@ def _curves(axes: Axes, records: Sequence[dict[str, Any]], names: dict[str, str]
 
 
 def running_mean(values: np.ndarray, *, share: int) -> np.ndarray:
-    """The mean over a window of one part in `share` of all values; shorter at the ends."""
+    """The mean over a window of `len(values) / share` values; shorter at the ends."""
     kernel = np.ones(max(1, len(values) // share))
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
 
 
 def plain(axes: Axes) -> None:
-    """A frame of two sides and a faint grid."""
+    """Leaves two sides of the frame, and adds a faint grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25)
 
 
 def bare(axes: Axes) -> None:
-    """Leaves a cell without frame and ticks."""
+    """Removes a cell's frame and ticks."""
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)

@@ -1,6 +1,6 @@
-"""HTML pages that open without a network: pictures and rotatable clouds in one file.
+"""HTML pages that need no network connection: images and rotatable point clouds in one file.
 
-`page` is the skeleton; the other functions make the pieces that stand in it.
+`page` makes the document; the other functions make the parts of its body.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ pre { background: white; border: 1px solid #dde3e8; padding: .8rem; overflow-x: 
 def write_reconstruction_page(
     path: str | Path, images: Tensor, points: Tensor, *, title: str, subtitle: str = ""
 ) -> None:
-    """Writes a page with the pictures of an object and the cloud found from them, to be turned by hand.
+    """Writes a page with the images of an object and its reconstruction, which can be turned with the mouse.
 
     Args:
         path: the .html file.
@@ -57,16 +57,16 @@ def write_reconstruction_page(
     """
     inputs = [picture(image, f"image {number}") for number, image in enumerate(images, 1)]
     body = [
-        "<h2>What went in</h2>",
+        "<h2>Input images</h2>",
         row(inputs, kind="inputs"),
-        "<h2>What came out</h2>",
-        row([cloud(points, "Drag to turn, scroll to come closer. Colour is height.", height_px=640)]),
+        "<h2>Reconstruction</h2>",
+        row([cloud(points, "Drag to turn, scroll to zoom. Colour is height.", height_px=640)]),
     ]
     write_text(Path(path), page(title, body, subtitle=subtitle))
 
 
 def page(title: str, body: Sequence[str], *, subtitle: str = "") -> str:
-    """A complete page; plotly's library is inside it if a cloud is."""
+    """A complete page; it includes plotly's library if it contains a cloud."""
     library = ""
     if any("Plotly.newPlot" in part for part in body):
         library = f"<script>{plotly.offline.get_plotlyjs()}</script>"
@@ -89,7 +89,7 @@ def paragraph(text: str) -> str:
 
 
 def row(parts: Sequence[str], *, kind: str = "") -> str:
-    """Pieces side by side, as far as the window is wide."""
+    """Parts side by side, wrapped at the window's width."""
     return f'<div class="row {kind}">{"".join(parts)}</div>'
 
 
@@ -108,24 +108,24 @@ def drawing(figure: Figure, caption: str) -> str:
 
 
 def cloud(points: Tensor, caption: str, *, height_px: int = 420, colours: str = "Viridis") -> str:
-    """A cloud (M, 3), y up, that the reader can turn."""
+    """A point cloud (M, 3), y up, that can be turned with the mouse."""
     x, y, z = coordinates = points.detach().cpu().numpy().astype(np.float32).round(4).T
-    # Plotly measures the eye's place in units of the cloud's mean extent; far enough to see all of it.
+    # Plotly's unit of the camera position is the cloud's mean extent; this distance shows all of the cloud.
     extent = np.ptp(coordinates, axis=1).clip(1e-3) if len(points) else np.ones(3)
     distance = 1.1 * np.linalg.norm(extent) / np.prod(extent) ** (1 / 3)
     eye = distance * np.array([0.5, 0.35, 0.79])
     marker = {"size": 3, "color": y, "colorscale": colours, "showscale": False}
     scatter = go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, hoverinfo="skip")
-    nothing = {"visible": False}
+    hidden = {"visible": False}
     figure = go.Figure(scatter)
     figure.update_layout(
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
         height=height_px,
         scene={
             "aspectmode": "data",
-            "xaxis": nothing,
-            "yaxis": nothing,
-            "zaxis": nothing,
+            "xaxis": hidden,
+            "yaxis": hidden,
+            "zaxis": hidden,
             "camera": {"up": {"x": 0, "y": 1, "z": 0}, "eye": dict(zip("xyz", eye.tolist(), strict=True))},
             "dragmode": "orbit",
         },
@@ -136,17 +136,8 @@ def cloud(points: Tensor, caption: str, *, height_px: int = 420, colours: str = 
     return f'<figure class="cloud"><div>{drawn}</div><figcaption>{html.escape(caption)}</figcaption></figure>'
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; the first column holds names, the others figures."""
-
-    def line(cells: Sequence[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-    return f"<table>{line(header, 'th')}{''.join(line(cells, 'td') for cells in rows)}</table>"
-
-
 def listing(text: str) -> str:
-    """Text as it is, for configurations."""
+    """Preformatted text, for configurations."""
     return f"<pre>{html.escape(text)}</pre>"
 
 

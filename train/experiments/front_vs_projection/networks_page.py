@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 
 from diffpoint import PinholeCamera
 from train.experiments.front_vs_projection.networks import TRAININGS, Examples
-from train.experiments.markdown import table_lines
 from train.experiments.statistics import spread_text, trainings
 from train.show import figures
+from train.show.tables import markdown_lines
 
 _FLOOR = "points of the true surface"
 _SINGLE = {
@@ -65,7 +65,7 @@ def markdown(found: Mapping[str, Any]) -> str:
         "How evenly predictions for single views lie on the surface. Density in front: 1 is as dense as behind. "
         "Imbalance: share of the points that would have to move for 32 parts of the surface to be as dense.",
         "",
-        *table_lines(["loss", "after", *_EVENNESS.values()], evenness, "llrr"),
+        *markdown_lines(["loss", "after", *_EVENNESS.values()], evenness, "llrr"),
     ]
     return "\n".join([*lines, ""])
 
@@ -83,7 +83,7 @@ def _table(
         lines.append(cells)
     if floor:
         lines.append([_FLOOR, *(f"{floor[m]:.2f}" if m in floor else "" for m in _SINGLE), "", ""])
-    return table_lines(head, lines)
+    return markdown_lines(head, lines)
 
 
 def _between(shares: Sequence[float]) -> str:

@@ -18,9 +18,9 @@ from torch import Tensor
 from train.evaluation.metrics import in_silhouette
 from train.experiments.front_vs_projection.free_clouds import LOSSES, MEASURED_EVERY, Fit, fit_cloud
 from train.experiments.front_vs_projection.shapes import Cameras, Scene, StudyShape
-from train.experiments.markdown import table_lines
 from train.files import replacing
 from train.show import figures
+from train.show.tables import markdown_lines
 
 MEASURES = {
     "visible_cd": "visible part, chamfer x100",
@@ -103,7 +103,7 @@ def markdown(found: Mapping[str, Any]) -> str:
         "",
         f"First step sizes, the best of three for each loss on another shape: {rates}.",
         "",
-        *table_lines(head, rows, "ll" + "r" * (len(head) - 2)),
+        *markdown_lines(head, rows, "ll" + "r" * (len(head) - 2)),
     ]
     if "front" in found["one_view"]:
         shape_names = list(found["shapes"])
@@ -122,7 +122,7 @@ def markdown(found: Mapping[str, Any]) -> str:
             "One view: error of the visible part, as a multiple of the front constraint's, smallest to largest over "
             "the seeds; and the largest gradient in the camera's x or y of any point at any step.",
             "",
-            *table_lines(["loss", *shape_names, "largest gradient in x, y"], rows),
+            *markdown_lines(["loss", *shape_names, "largest gradient in x, y"], rows),
         ]
     return "\n".join([*lines, ""])
 

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, project
 from train.data.render import orbit_camera
-from train.experiments.markdown import table_lines
 from train.experiments.one_armed.chairs import SEED, make_chair
 from train.experiments.statistics import claim_lines, spread_text, trainings
 from train.experiments.store import Metrics
 from train.show import figures
+from train.show.tables import markdown_lines
 
 ROWS = PLAIN, _, PSGN, _, CODED, TWO, TRUTH = (
     "deterministic, A",
@@ -57,7 +57,7 @@ def markdown(result: Mapping[str, Any]) -> str:
         f"{codes['draw_it']:.0%} of the codes predict more than half of it."
     )
     last = "A network that predicts no arms predicts no missing ones either; the last two claims exclude that case."
-    lines = [head, "", *table_lines(["", *COLUMNS.values()], rows)]
+    lines = [head, "", *markdown_lines(["", *COLUMNS.values()], rows)]
     for paragraph in (single, _weak_networks(result["rows"]), last):
         lines += ["", paragraph]
     return "\n".join([*lines, "", *claim_lines(result["claims"]), ""])
