@@ -203,7 +203,7 @@ class Rules:
 class Data:
     """Make a data tree, check it, or draw it.
 
-    A data tree is the folder that `fit` and `evaluate` read: the views, depth maps, cameras and point cloud of each shape,
+    A data tree is the folder that `fit` and `evaluate` read: views, depth maps, cameras and point cloud of each shape,
     and the lists of the training, validation and test split; see docs/data.md.
     """
 
