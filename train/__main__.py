@@ -119,7 +119,7 @@ class Reconstruct:
 
 @dataclasses.dataclass
 class Evaluate:
-    """Score a run on held-out shapes, beside two answers that need no network; writes evaluation.json.
+    """Score a run on held-out shapes, together with two retrieval baselines; writes evaluation.json.
 
     Distances are un-squared and x100. F at 1%: the F-score with a threshold of 0.01 world units, 1 % of an object's
     size. EMD: after both clouds are thinned to the size of one prediction.

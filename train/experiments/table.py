@@ -132,7 +132,7 @@ class Table:
     """One table.
 
     Attributes:
-        title: the question that it answers, in a line.
+        title: what it compares, in a line.
         rows: from top to bottom.
         claims: what the paper's table shows.
         category_claims: what it shows in every category; with any, the table has a line for each category.
