@@ -16,9 +16,9 @@ from diffpoint.io import read_points, write_points
 from models import build_generator
 from train.__main__ import main
 from train.data import Shape, ShapeTree, tree_files
-from train.data.axis_frames import TURNS, describe, find_frame
 from train.data.check import check_tree
-from train.data.choy_layout import cam_from_world, pictures_of
+from train.data.consistency import TURNS, describe, find_frame
+from train.data.layouts import cam_from_world, pictures_of
 from train.data.procedural import generate
 from train.data.render import Renderer, draw_camera
 from train.data.surface import Surface

@@ -10,7 +10,6 @@ import trimesh
 from PIL import Image
 
 from train.data import ShapeTree, tree_files
-from train.data.mesh_files import load_surface
 from train.data.mesh_sources import (
     UPRIGHT,
     MeshFile,
@@ -20,10 +19,9 @@ from train.data.mesh_sources import (
     read_labels,
     shape_ids,
 )
-from train.data.meshes import LEFT_OUT, MeshOptions, MeshReport, convert
+from train.data.meshes import LEFT_OUT, MeshOptions, MeshReport, convert, load_surface, sample_visible
 from train.data.rasterise import Rasteriser
 from train.data.render import Orbit, Renderer, draw_camera
-from train.data.visible_samples import sample_visible
 from train.errors import UserError
 
 SMALL = {"size": 32, "views": 2, "processes": 1}

@@ -12,8 +12,7 @@ from PIL import Image
 
 from models import build_generator
 from train.__main__ import main
-from train.data.cutout import FILL, cut_out
-from train.data.foreground import NotPlain, find_foreground
+from train.data.cutout import FILL, NotPlain, cut_out, find_foreground
 from train.data.images import read_rgba
 from train.data.photos import convert_photos, find_photos
 from train.errors import UserError

@@ -12,8 +12,8 @@ from train.__main__ import main
 from train.data import ShapeTree, tree_files
 from train.data.ambiguity_check import measure_families, measure_tree
 from train.data.categories import SYNSET_OF
+from train.data.contact_sheet import draw_families
 from train.data.families import AMBIGUOUS, FAMILIES, MODES, Cone
-from train.data.family_pictures import draw_families
 from train.data.procedural import ambiguity, generate, variants_of
 from train.data.render import MAX_RADIUS, Renderer, orbit_camera
 from train.data.solids import (

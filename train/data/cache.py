@@ -32,11 +32,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from diffpoint.camera import PinholeCamera
-from train.data.axis_frames import Frame
 from train.data.categories import category_of
+from train.data.consistency import Frame
+from train.data.layouts import layout_of
 from train.data.shape import Shape, ShapeError
 from train.data.shrink import Sizes, shrink
-from train.data.tree import frame_of, layout_of, read_shape
+from train.data.tree import frame_of, read_shape
 from train.errors import UserError
 from train.files import replacing
 from train.processes import map_unordered, progress_bar

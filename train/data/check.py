@@ -12,11 +12,11 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from train.data import tree_files
-from train.data.axis_frames import AS_IT_IS, Frame, find_frame
 from train.data.cache import damaged_files
 from train.data.categories import category_of
-from train.data.consistency import Consistency, measure_consistency
-from train.data.tree import Shape, ShapeError, ShapeTree, frame_of, layout_of, read_shape, sample_shapes
+from train.data.consistency import AS_IT_IS, Consistency, Frame, find_frame, measure_consistency
+from train.data.layouts import layout_of
+from train.data.tree import Shape, ShapeError, ShapeTree, frame_of, read_shape, sample_shapes
 from train.processes import map_unordered
 
 _INK = 0.85

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from train.config import FitConfig, PretrainConfig, StageConfig, fit_config_from_json, to_json
 from train.data.batches import Batch, LoadedSplit, Sampler
-from train.data.tree import require_depth
+from train.data.layouts import require_depth
 from train.distributed import SINGLE, World, connect
 from train.errors import UserError
 from train.evaluation.runs import (
