@@ -23,9 +23,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from diffpoint import front_constraint, projection_loss, soft_projection_loss
+from diffpoint import chamfer_distance, front_constraint, projection_loss, soft_projection_loss
 from train.errors import UserError
-from train.evaluation.metrics import cloud_errors, in_silhouette, visible_error
+from train.evaluation.metrics import in_silhouette, visible_error
 from train.experiments.front_vs_projection.scenes import (
     EMBEDDED,
     POINTS,
@@ -144,7 +144,7 @@ def fit_cloud(
             sideways.append((across.norm() / whole).item() if whole > 0 else 0.0)
             largest = max(largest, across.abs().max().item())
             clouds.append(_existing(cloud, logits))
-    errors = cloud_errors(clouds[-1], scene.surface)
+    whole = chamfer_distance(clouds[-1], scene.surface, squared=False)
     visible = [
         visible_error(each, scene.camera, scene.depth).mean().item()
         for each in (*clouds[:-1:_MEASURED_EVERY], clouds[-1])
@@ -152,8 +152,8 @@ def fit_cloud(
     measured = {
         "visible_cd": visible[-1],
         "inside": in_silhouette(clouds[-1], scene.camera, scene.depth).float().mean().item(),
-        "pred_to_gt": errors.pred_to_gt.item(),
-        "gt_to_pred": errors.gt_to_pred.item(),
+        "pred_to_gt": 100 * whole.a_to_b.item(),
+        "gt_to_pred": 100 * whole.b_to_a.item(),
         "left": clouds[-1].shape[1] / scene.start.shape[1],
         "sideways": sum(sideways) / iterations,
     }
@@ -382,16 +382,17 @@ def draw(found: Mapping[str, Any], shape: StudyShape, out: Path) -> dict[str, Fi
             _draw_cloud(axes, one, of_one[loss][step])
         _draw_cloud(row[-2], many, of_many[loss][steps[-1]])
         _draw_cloud(row[-1], one, one.surface[0, ::3])
-        row[0].text(-0.8, 0.5, LOSSES[loss].title, color=LOSSES[loss].colour, fontsize=9, fontweight="bold")
-        row[0].annotate("", (-0.5, 0), (-0.85, 0), arrowprops={"arrowstyle": "->", "lw": 1.5})
+        name = {"rotation": 90, "va": "center", "color": LOSSES[loss].colour, "fontweight": "bold"}
+        row[0].text(-0.85, 0, LOSSES[loss].title, fontsize=8, **name)
+        row[0].annotate("", (-0.5, 0), (-0.75, 0), arrowprops={"arrowstyle": "->", "lw": 1.5})
     names = [f"{ONE.name}, step {step}" for step in shown]
     names += [f"{MANY.name}, step {steps[-1]}", "the shape itself"]
     for axes, name in zip(panels[0], names, strict=True):
         axes.set_title(name, fontsize=9)
     figures.headline(
         figure,
-        f"{shape.name}, 1 seed, seen from 70\N{DEGREE SIGN} beside the first camera, which looks from the left "
-        "(arrow). Green: the point falls into the silhouette of every view. Red: it does not.",
+        f"{shape.name}, 1 seed, from 70\N{DEGREE SIGN} beside the first camera (arrow); green: points in the silhouette "
+        "of every view; red: others",
     )
     return {"": curves(found), "-clouds": figure}
 

@@ -331,7 +331,7 @@ def curves(found: Mapping[str, Any]) -> Figure:
         fontsize=14,
     )
     rows = np.asarray(figure.subplots(2, len(_PANELS)))
-    parts = {"single": "Stage 1 on single views", "many": "Joined views from the first step"}
+    parts = {"single": "stage 1, single views", "many": "joined views from the start"}
     for panels, (part, title) in zip(rows, parts.items(), strict=True):
         for axes, (name, label) in zip(panels, _PANELS.items(), strict=True):
             start = 0.0
