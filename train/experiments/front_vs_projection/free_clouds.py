@@ -391,8 +391,8 @@ def draw(found: Mapping[str, Any], shape: StudyShape, out: Path) -> dict[str, Fi
         axes.set_title(name, fontsize=9)
     figures.headline(
         figure,
-        f"{shape.name}, 1 seed, from 70\N{DEGREE SIGN} beside the first camera (arrow); green: points in the silhouette "
-        "of every view; red: others",
+        f"{shape.name}, 1 seed, from 70\N{DEGREE SIGN} beside the first camera (arrow); green: points in the "
+        "silhouette of every view; red: others",
     )
     return {"": curves(found), "-clouds": figure}
 
