@@ -45,9 +45,6 @@ ONE, MANY = Cameras(1), Cameras(24, sphere=True)
 SETTINGS = (ONE, Cameras(2), Cameras(4), Cameras(8), Cameras(8, sphere=True), MANY)
 RATES = (0.003, 0.01, 0.03)
 _TUNED_ON = (ONE, Cameras(8, sphere=True))
-_EMD_VIEWS = 1
-"""The assignment of a cloud that is far from its target takes most of a second per view: it is measured with one
-view."""
 _ITERATIONS, _LEAST_ITERATIONS, _MEASURED_EVERY = 200, 20, 10
 _SHAPES = 2
 MEASURES = {
@@ -102,21 +99,14 @@ LOSSES = {
 def fit_cloud(
     scene: Scene, loss: str, *, iterations: int, rate: float
 ) -> tuple[dict[str, Any], list[Tensor]]:
-    """Minimises one loss by Adam from the start cloud, with a step size that falls from `rate` to 0 along a cosine.
-
-    Args:
-        scene: the views of a shape.
-        loss: of `LOSSES`.
-        iterations: steps.
-        rate: first step size, in world units (of logits, in theirs).
+    """Minimises one of `LOSSES` by Adam, with a step size that falls from `rate` (world units) to 0 along a cosine.
 
     Returns:
-        Errors of the cloud, the same for every loss, and its history, as plain JSON values: "visible_cd", the chamfer
-        distance x100 between the visible part of the cloud and of the shape, mean over the views; "inside", the share
-        of points that project into the silhouettes; "pred_to_gt" and "gt_to_pred", mean distances x100 from the cloud
-        to the whole shape and back; "left", the share of points that were not removed; "sideways", the share of the
-        gradient in the first camera's x and y, mean over iterations; "largest_sideways", of any point at any iteration.
-        And the clouds (N, 3) before every iteration and after the last.
+        Errors of the last cloud: "visible_cd", the chamfer distance x100 between the visible part of the cloud and of
+        the shape, mean over the views; "inside", the share of points in the silhouettes; "pred_to_gt" and "gt_to_pred",
+        mean distances x100 to the whole shape and back; "left", the share of points that were not removed. Of the
+        gradient: "sideways", its share in the first camera's x and y, mean over iterations; "largest_sideways", of any
+        point at any iteration. And the clouds (N, 3) before every iteration and after the last.
 
     Example:
         >>> from train.experiments.front_vs_projection.scenes import Cameras, embedded_shape
@@ -176,9 +166,8 @@ def _existing(cloud: Tensor, logits: Tensor) -> Tensor:
 def free_clouds(study: Study) -> tuple[dict[str, Any], dict[str, Figure]]:
     """Fits every cloud that has not been fitted yet; writes the animation.
 
-    Args:
-        study: its data are data trees and sources of meshes, see `scenes.shapes_of`; procedural shapes take part
-            always. Its seeds draw start clouds and turns of the cameras.
+    The shapes are procedural ones and those of the study's data, see `scenes.shapes_of`. Seeds draw start clouds and
+    turns of the cameras.
 
     Returns:
         All numbers, and figures by the ending of their files.
@@ -198,7 +187,7 @@ def free_clouds(study: Study) -> tuple[dict[str, Any], dict[str, Figure]]:
         raise UserError(f"two shapes of --data are called {', '.join(sorted(doubles))}; leave one source out")
     with _one_thread():
         rates = {
-            loss: _best_rate(study, loss, iterations)
+            loss: _best_rate(study, loss)
             for loss in progress_bar(LOSSES, title="step sizes", unit="loss", progress=study.progress)
         }
         cells = [
@@ -211,7 +200,7 @@ def free_clouds(study: Study) -> tuple[dict[str, Any], dict[str, Figure]]:
         ]
         bar = progress_bar(cells, title="free clouds", unit="fit", progress=study.progress)
         fits = [
-            _fit(study, shape, cameras, loss, seed, rates[loss], iterations)
+            _fit(study, shape, cameras, loss, seed=seed, rate=rates[loss])
             for shape, cameras, loss, seed in bar
         ]
         found = {
@@ -236,49 +225,35 @@ def _one_thread() -> Iterator[None]:
 
 
 def takes_part(loss: str, cameras: Cameras) -> bool:
-    """Is a loss measured with these cameras?"""
-    return loss != "front_emd" or cameras.count <= _EMD_VIEWS
+    """Is a loss measured with these cameras? An assignment far from its target takes most of a second per view."""
+    return loss != "front_emd" or cameras == ONE
 
 
-def _best_rate(study: Study, loss: str, iterations: int) -> float:
+def _best_rate(study: Study, loss: str) -> float:
     """The best step size, on a shape that is not in the study, by the geometric mean of errors of the visible part."""
     shape = embedded_shape("bench", seed=1)
 
     def error(rate: float) -> float:
-        fits = (
-            _fit(study, shape, cameras, loss, 0, rate, iterations, prefix=f"tuning_{rate:g}_")
-            for cameras in _TUNED_ON
-            if takes_part(loss, cameras)
-        )
+        prefix, views = f"tuning_{rate:g}_", [cameras for cameras in _TUNED_ON if takes_part(loss, cameras)]
+        fits = (_fit(study, shape, cameras, loss, seed=0, rate=rate, prefix=prefix) for cameras in views)
         return sum(math.log(fit["visible_cd"]) for fit in fits if fit is not None)
 
     return min(RATES, key=error)
 
 
 def _fit(
-    study: Study,
-    shape: StudyShape,
-    cameras: Cameras,
-    loss: str,
-    seed: int,
-    rate: float,
-    iterations: int,
-    *,
-    prefix: str = "",
+    study: Study, shape: StudyShape, cameras: Cameras, loss: str, *, seed: int, rate: float, prefix: str = ""
 ) -> dict[str, Any] | None:
     """The record of a fit, made now or kept from the same scene and settings; None if the shape has no such views."""
-    scene = shape.scene(cameras, seed=seed)
+    scene, iterations = shape.scene(cameras, seed=seed), study.steps or _ITERATIONS
     if scene is None:
         return None
     parts = (scene.depth, scene.camera.cam_from_world, scene.surface, scene.start)
     digest = hashlib.sha256(b"".join(part.contiguous().numpy().tobytes() for part in parts)).hexdigest()[:16]
     key = {"iterations": iterations, "rate": rate, "scene": digest}
     name = f"{prefix}{shape.name}-{cameras.name.replace(' ', '-')}-{loss}-seed{seed}.json"
-    record = kept(
-        study.out / "free-clouds" / name,
-        key,
-        lambda: fit_cloud(scene, loss, iterations=iterations, rate=rate)[0],
-    )
+    path = study.out / "free-clouds" / name
+    record = kept(path, key, lambda: fit_cloud(scene, loss, iterations=iterations, rate=rate)[0])
     return {"shape": shape.name, "cameras": cameras.name, "loss": loss, "seed": seed, **record}
 
 
@@ -448,6 +423,7 @@ def animate(scene: Scene, fits: Mapping[str, Sequence[Tensor]], steps: Sequence[
             _draw_cloud(axes, scene, clouds[step])
             axes.set_title(LOSSES[loss].title, fontsize=9, color=LOSSES[loss].colour)
         figures.headline(figure, f"one view, from the left; step {step}")
+        figure.set_dpi(75)
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3])

@@ -65,13 +65,24 @@ class Training(NamedTuple):
 
     def single(self, config: FitConfig) -> FitConfig:
         """A profile's recipe under this loss: stage 1 on single views, then stage 2 on joined ones."""
-        stage1 = self._stage(config.stage1, _STAGE1_SHARE)
-        return _with_stages(config, stage1, self._stage(config.stage2, _STAGE2_SHARE))
+        return self._config(config, self._stage(config.stage1, _STAGE1_SHARE), _STAGE2_SHARE)
 
     def many(self, config: FitConfig) -> FitConfig:
         """A profile's recipe under this loss: stage 2 alone, from fresh weights and longer."""
-        stage1 = dataclasses.replace(config.stage1, steps=0)
-        return _with_stages(config, stage1, self._stage(config.stage2, _MANY_SHARE))
+        return self._config(config, dataclasses.replace(config.stage1, steps=0), _MANY_SHARE)
+
+    def _config(self, config: FitConfig, stage1: StageConfig, stage2_share: float) -> FitConfig:
+        stage2 = self._stage(config.stage2, stage2_share)
+        every = max(1, stage2.steps // 4)
+        return dataclasses.replace(
+            config,
+            stage1=stage1,
+            stage2=stage2,
+            min_image_sensitivity=0.0,  # a collapse is a result here
+            validate_every=every,
+            collapse_check_every=every,
+            validation_shapes=min(16, config.validation_shapes),
+        )
 
     def _stage(self, like: StageConfig, share: float) -> StageConfig:
         return dataclasses.replace(
@@ -80,20 +91,6 @@ class Training(NamedTuple):
             supervision=self.supervision,
             visibility=self.visibility,
         )
-
-
-def _with_stages(config: FitConfig, stage1: StageConfig, stage2: StageConfig) -> FitConfig:
-    """Without the check for collapse: here a collapse is a result."""
-    every = max(1, stage2.steps // 4)
-    return dataclasses.replace(
-        config,
-        stage1=stage1,
-        stage2=stage2,
-        min_image_sensitivity=0.0,
-        validate_every=every,
-        collapse_check_every=every,
-        validation_shapes=min(16, config.validation_shapes),
-    )
 
 
 TRAININGS = {

@@ -5,7 +5,6 @@ The frame of a scene is that of its first camera, in which the x and y of a grad
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -73,22 +72,16 @@ class Scene(NamedTuple):
     """(1, N, 3) the cloud that every fit starts from: uniform in a cube of side 1 around the shape."""
 
 
-@dataclasses.dataclass(frozen=True)
-class StudyShape:
-    """A shape that can be seen from several `Cameras`.
-
-    Attributes:
-        name: unique in a study, and safe as a file's name.
-        source: where it comes from, for the reader of a table.
-        see: cameras and a turn in degrees to (camera (V,), depth (V, H, W)), world frame; None where the shape cannot
-            be seen from there.
-        surface: (4096, 3) points, world frame.
-    """
+class StudyShape(NamedTuple):
+    """A shape that can be seen from several `Cameras`. Names are unique in a study, and safe as a file's name."""
 
     name: str
     source: str
+    """Where it comes from, for the reader of a table."""
     see: Callable[[Cameras, float], tuple[PinholeCamera, Tensor] | None]
+    """Cameras and a turn in degrees to (camera (V,), depth (V, H, W)), world frame; None if it has no such views."""
     surface: Tensor
+    """(4096, 3) points, world frame."""
 
     def scene(self, cameras: Cameras, *, seed: int, points: int = POINTS) -> Scene | None:
         """The views, turned at random, and a random cloud to start from; None if the shape has no such views."""
