@@ -6,6 +6,7 @@ The paper gives one time and one share for clouds of 2048 and of 10 000 points, 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import os
 import platform
@@ -111,23 +112,21 @@ def medians(
 
 def _times(scenes: Sequence[Scene], count: int, rounds: tuple[int, int], *, progress: bool) -> dict[str, Any]:
     """Milliseconds of one cloud in one view: the median over shapes, and each."""
-    bar = progress_bar(scenes, title=f"times, {count} points", unit="shape", progress=progress)
-    by_shape = pd.DataFrame([_times_of(scene, count, rounds) for scene in bar])
+    found = []
+    for scene in progress_bar(scenes, title=f"times, {count} points", unit="shape", progress=progress):
+        cloud, camera = scene.clouds[count][None], scene.camera[0].resize(HEADLINES[0], HEADLINES[0])
+        sampling = {
+            "zbuffer": lambda c=cloud, k=camera: sample_view(c, splat_depth(c, k)),
+            "horizon": lambda c=cloud, k=camera: sample_view(c, visible_points(c, k, method="horizon")),
+        }
+        triangulation = {"triangulation": functools.partial(Delaunay, cloud[0].double().numpy())}
+        # In turns by shape only: what is called right after a triangulation finds cold caches, and takes twice its
+        # time. And in the thread's time: on a busy machine, wall-clock time would include other load in long calls and
+        # not in short ones.
+        times = medians(sampling, rounds=rounds[0])
+        found.append(times | medians(triangulation, rounds=rounds[1], clock=time.thread_time))
+    by_shape = pd.DataFrame(found)
     return {"points": count, **_with_ratio(by_shape.median().to_dict()), "by_shape": by_shape.to_dict("list")}
-
-
-def _times_of(scene: Scene, count: int, rounds: tuple[int, int]) -> dict[str, float]:
-    cloud, camera = scene.clouds[count][None], scene.camera[0].resize(HEADLINES[0], HEADLINES[0])
-    xyz = cloud[0].double().numpy()
-    sampling: dict[str, Callable[[], Any]] = {
-        "zbuffer": lambda: sample_view(cloud, splat_depth(cloud, camera)),
-        "horizon": lambda: sample_view(cloud, visible_points(cloud, camera, method="horizon")),
-    }
-    # In turns by shape only: what is called right after a triangulation finds cold caches, and takes twice its time.
-    # And in the thread's time: on a busy machine, wall-clock time would include other load in long calls and not in
-    # short ones.
-    found = medians(sampling, rounds=rounds[0])
-    return found | medians({"triangulation": lambda: Delaunay(xyz)}, rounds=rounds[1], clock=time.thread_time)
 
 
 def _claim(times: Mapping[str, Any]) -> dict[str, Any]:

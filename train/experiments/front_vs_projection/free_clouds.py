@@ -6,6 +6,7 @@ OUT/free-clouds/*.json holds one fit each: a stopped study continues there.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 import time
 import warnings
@@ -26,15 +27,8 @@ from torch import Tensor
 from diffpoint import chamfer_distance, front_constraint, projection_loss, soft_projection_loss
 from train.errors import UserError
 from train.evaluation.metrics import in_silhouette, visible_error
-from train.experiments.front_vs_projection.scenes import (
-    EMBEDDED,
-    POINTS,
-    Cameras,
-    Scene,
-    StudyShape,
-    embedded_shape,
-    shapes_of,
-)
+from train.experiments.front_vs_projection import scenes
+from train.experiments.front_vs_projection.scenes import Cameras, Scene, StudyShape
 from train.experiments.study import Study
 from train.files import kept, replacing
 from train.processes import progress_bar
@@ -178,10 +172,10 @@ def free_clouds(study: Study) -> tuple[dict[str, Any], dict[str, Figure]]:
     limit, iterations = study.limit or _SHAPES, study.steps or _ITERATIONS
     if iterations < _LEAST_ITERATIONS:
         raise UserError(f"a fit needs at least --steps {_LEAST_ITERATIONS}; got {iterations}")
-    if limit > len(EMBEDDED):
-        raise UserError(f"--limit must be at most {len(EMBEDDED)}; got {limit}")
-    shapes = [embedded_shape(category) for category in EMBEDDED[:limit]]
-    shapes += shapes_of(study.data, limit=limit)
+    if limit > len(scenes.EMBEDDED):
+        raise UserError(f"--limit must be at most {len(scenes.EMBEDDED)}; got {limit}")
+    shapes = [scenes.embedded_shape(category) for category in scenes.EMBEDDED[:limit]]
+    shapes += scenes.shapes_of(study.data, limit=limit)
     names = [shape.name for shape in shapes]
     if doubles := {name for name in names if names.count(name) > 1}:
         raise UserError(f"two shapes of --data are called {', '.join(sorted(doubles))}; leave one source out")
@@ -191,18 +185,12 @@ def free_clouds(study: Study) -> tuple[dict[str, Any], dict[str, Figure]]:
             for loss in progress_bar(LOSSES, title="step sizes", unit="loss", progress=study.progress)
         }
         cells = [
-            (shape, cameras, loss, seed)
-            for seed in range(study.seeds)
-            for shape in shapes
-            for cameras in SETTINGS
-            for loss in LOSSES
-            if takes_part(loss, cameras)
+            cell
+            for cell in itertools.product(range(study.seeds), shapes, SETTINGS, LOSSES)
+            if takes_part(cell[3], cell[2])
         ]
         bar = progress_bar(cells, title="free clouds", unit="fit", progress=study.progress)
-        fits = [
-            _fit(study, shape, cameras, loss, seed=seed, rate=rates[loss])
-            for shape, cameras, loss, seed in bar
-        ]
+        fits = [_fit(study, *cell[1:], seed=cell[0], rate=rates[cell[3]]) for cell in bar]
         found = {
             "iterations": iterations,
             "seeds": study.seeds,
@@ -231,7 +219,7 @@ def takes_part(loss: str, cameras: Cameras) -> bool:
 
 def _best_rate(study: Study, loss: str) -> float:
     """The best step size, on a shape that is not in the study, by the geometric mean of errors of the visible part."""
-    shape = embedded_shape("bench", seed=1)
+    shape = scenes.embedded_shape("bench", seed=1)
 
     def error(rate: float) -> float:
         prefix, views = f"tuning_{rate:g}_", [cameras for cameras in _TUNED_ON if takes_part(loss, cameras)]
@@ -315,9 +303,9 @@ def markdown(found: Mapping[str, Any]) -> str:
     seeds, shapes = _counted(found["seeds"], "seed"), _counted(len(found["shapes"]), "shape")
     names = ", ".join(f"{shape} ({source})" for shape, source in found["shapes"].items())
     lines = [
-        f"Free clouds of {POINTS} points, {found['iterations']} steps of Adam, {seeds} (start and turn of the cameras) "
-        f"of each of {shapes}: {names}. Mean ± standard deviation over shapes and seeds; distances are un-squared, "
-        "x100, of shapes about 1 across.",
+        f"Free clouds of {scenes.POINTS} points, {found['iterations']} steps of Adam, {seeds} (start and turn of the "
+        f"cameras) of each of {shapes}: {names}. Mean ± standard deviation over shapes and seeds; distances are "
+        "un-squared, x100, of shapes about 1 across.",
         "",
         f"First step sizes, the best of three for each loss on another shape: {rates}.",
         "",
