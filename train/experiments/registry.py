@@ -44,7 +44,7 @@ EXPERIMENTS = {
     ),
     "one-armed": Entry(
         "does the deterministic network invent the hidden arm rest of a chair, and does ours avoid it with two views?",
-        "one_armed.measure:one_armed",
+        "one_armed:one_armed",
     ),
     "coverage": Entry(
         "do predictions reach all backs that a front can have, and are any unlike all of them?",
