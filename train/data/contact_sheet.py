@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -125,9 +126,7 @@ def _title(text: str) -> np.ndarray:
 
 def _arranged(strips: Sequence[np.ndarray]) -> np.ndarray:
     """Strips below each other, in as many columns as keep the sheet about as wide as high."""
-    columns = 1
-    while -(-len(strips) // columns) > _TALLEST * columns:
-        columns += 1
+    columns = math.ceil(math.sqrt(len(strips) / _TALLEST))
     height = -(-len(strips) // columns)
     blank = np.full_like(strips[0], 255)
     padded = [*strips, *[blank] * (columns * height - len(strips))]
