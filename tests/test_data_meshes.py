@@ -21,7 +21,7 @@ from train.data.mesh_sources import (
     shape_ids,
 )
 from train.data.meshes import LEFT_OUT, MeshOptions, MeshReport, convert, load_surface, sample_visible
-from train.data.rasterise import Rasteriser
+from train.data.rays import Rasteriser
 from train.data.render import Orbit, Renderer, draw_camera
 from train.errors import UserError
 

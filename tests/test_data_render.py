@@ -10,9 +10,8 @@ import trimesh
 from trees import plain_surface
 
 from diffpoint.camera import PinholeCamera
-from train.data.embree import EmbreeCaster, has_embree
 from train.data.procedural import variants_of
-from train.data.rasterise import Rasteriser
+from train.data.rays import EmbreeCaster, Rasteriser, has_embree
 from train.data.render import MAX_RADIUS, Orbit, Renderer, draw_camera, orbit_camera
 from train.data.solids import surface_of
 from train.data.surface import Surface

@@ -1,6 +1,6 @@
 """Views of a surface: exact depth at pixel centres, shaded colour, no OpenGL.
 
-Which face each pixel sees is found by embree, or by the z-buffer of `rasterise` where embree is not installed; the rest
+Which face each pixel sees is found by embree, or by the z-buffer of `rays` where embree is not installed; the rest
 is the same for both.
 """
 
@@ -13,9 +13,8 @@ import numpy as np
 import torch
 
 from diffpoint.camera import PinholeCamera
-from train.data.embree import EmbreeCaster, has_embree
-from train.data.rasterise import Rasteriser
-from train.data.surface import Hits, Surface
+from train.data.rays import EmbreeCaster, Hits, Rasteriser, has_embree
+from train.data.surface import Surface
 from train.errors import UserError
 
 DISTANCE = 2.0
