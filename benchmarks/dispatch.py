@@ -5,6 +5,7 @@ The bare ops are the same source files, loaded with another `register`; only the
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import sys
 import time
@@ -47,7 +48,8 @@ def measure() -> list[dict[str, Any]]:
         "farthest_point_sample (no gradient)": ("sampling", lambda m: m.farthest_point_sample(a, 4)),
     }
     return [
-        _compare(op, lambda: call(dp), lambda: call(bare[module])) for op, (module, call) in calls.items()
+        _compare(op, functools.partial(call, dp), functools.partial(call, bare[module]))
+        for op, (module, call) in calls.items()
     ]
 
 

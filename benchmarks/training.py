@@ -69,14 +69,15 @@ def _shares(trainer: Trainer, warm: int, steps: int) -> dict[str, Any]:
     parts: dict[str, list[float]] = {}
     rendering: list[float] = []
 
-    def timed(*arguments: Any, **options: Any) -> Any:
+    original = losses.front_sets
+
+    def front_sets(*arguments: Any, **options: Any) -> Any:
         start = time.perf_counter()
-        result = front_sets(*arguments, **options)
+        result = original(*arguments, **options)
         rendering.append(time.perf_counter() - start)
         return result
 
-    front_sets = losses.front_sets
-    with mock.patch.object(losses, "front_sets", timed):
+    with _replaced(front_sets):
         for _ in range(steps):
             rendering.clear()
             trainer.timer.reset()
@@ -152,10 +153,16 @@ def reference_ops(assign: Callable[[Any], Tensor] = reference.assign) -> Iterato
         return dp.Transport(cost, assignment, torch.zeros_like(cost), converged, prices)
 
     replacements = [visible_points, sample_view, unproject, chamfer_distance, earth_mover_distance]
+    with mock.patch.object(reference, "assign", assign), _replaced(*replacements):
+        yield
+
+
+@contextlib.contextmanager
+def _replaced(*functions: Callable) -> Iterator[None]:
+    """Within, the losses use these functions instead of those of the same names."""
     with contextlib.ExitStack() as stack:
-        stack.enter_context(mock.patch.object(reference, "assign", assign))
         for module in (losses, train_losses):
-            for function in replacements:
+            for function in functions:
                 if hasattr(module, function.__name__):
                     stack.enter_context(mock.patch.object(module, function.__name__, function))
         yield

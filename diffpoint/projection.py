@@ -46,8 +46,8 @@ def projection_loss(
         points: (B, N, 3) predicted clouds in the world.
         camera: batch shape (), (V,) or (B, V), of the depth maps' size.
         depth: (B, V, H, W) true depth maps, +inf where empty.
-        logits: (B, N) of the points' existence. Points with a logit of 0 or less are not rendered. Without logits all
-            points exist, with a logit of 1.
+        logits: (B, N) occupancy logits of the points. Points with a logit of 0 or less are not rendered. Without
+            logits all points exist, with a logit of 1.
         mask_weight: of the mask term, the mean over all pixels of the binary cross entropy between the silhouette and
             the rendered logits. A pixel's logit is that of its nearest rendered point; if only points that are not
             rendered fall into it, that of the nearest of them; -1 if none does. 0 leaves the term out.

@@ -31,7 +31,7 @@ from torch import Tensor
 
 import diffpoint as dp
 
-# Each takes a cloud (1, N, 3), logits (1, N) of its points' existence, views, and the progress of the fit in [0, 1].
+# Each takes a cloud (1, N, 3), occupancy logits (1, N), views, and the progress of the fit in [0, 1].
 LOSSES = {
     "projection loss": lambda cloud, logits, views, t: dp.projection_loss(cloud, *views),
     "Lin et al.": lambda cloud, logits, views, t: dp.projection_loss(

@@ -34,7 +34,8 @@ def build_generator(
     """Builds a generator with freshly drawn weights (seed torch for reproducible ones).
 
     Args:
-        profile: "full" (192 x 256 images, 2048 points), "cpu" (96 x 128, 512) or "smoke" (48 x 64, 128).
+        profile: "full" (192 x 256 images, 2048 points, 40.73 million parameters), "cpu" (96 x 128, 512 points) or
+            "smoke" (48 x 64, 128 points).
         deterministic: without the code branch; codes are accepted and ignored.
         output_head: "points" (the released network) or "latent" (see `GeneratorConfig`).
         config: sizes of your own; the other arguments are then ignored.

@@ -24,7 +24,7 @@ class GeneratorConfig:
         output_head: "points": a fully connected and a convolutional branch predict the points (the released network).
             "latent": the network predicts a latent code of the auto-encoder of shapes, whose frozen decoder, set by
             `adopt_decoder`, computes the points (the network of the paper's text).
-        occupancy_logits: predict for every point a logit of its existence too, for losses that may delete points.
+        occupancy_logits: also predict an occupancy logit for every point, for losses that may delete points.
     """
 
     profile: str = "cpu"

@@ -17,13 +17,13 @@ import pytest
 import torch
 from PIL import Image
 from torch import Tensor
-from train.data.rules import Hider
 
 from diffpoint import PinholeCamera
 from models import build_generator
 from models.parts import prepare_images
 from tests.photographs import as_jpeg, surface_for, take
 from train.config import InferenceConfig
+from train.data.ambiguity_check import AmbiguousObject
 from train.data.batches import Batch, LoadedSplit
 from train.data.families.chair import CHAIR
 from train.data.photos import convert_photos
@@ -147,7 +147,7 @@ def test_coverage_is_measured_and_drawn(study: Study, monkeypatch: pytest.Monkey
 
 
 def test_backs_cover_themselves_and_nothing_else_does() -> None:
-    obj = make_object(Hider("loudspeaker", (0, 2)), 64)
+    obj = make_object(AmbiguousObject("loudspeaker", (0, 2)), 64)
     near = obj.limits[APART]
     assert reach(hidden_distances(obj.backs, obj.backs), near) == (1, 0)
     assert reach(hidden_distances(obj.again[:, :1024].contiguous(), obj.backs), near) == (1, 0)

@@ -7,17 +7,21 @@ import dataclasses
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 import trimesh
 from PIL import Image
+from torch import Tensor
 
 from diffpoint import PinholeCamera, chamfer_distance, unproject
 from models import Generator, build_generator
 from models.parts import PointDecoder
 from models.sizes import PROFILES as SIZES
 from train.__main__ import main
+from train.config import FitConfig, StageConfig
+from train.data.batches import Batch
 from train.errors import UserError
 from train.evaluation.metrics import in_silhouette, visible_error
 from train.experiments.front_vs_projection import experiment, networks_page, page
@@ -27,7 +31,7 @@ from train.experiments.front_vs_projection.shapes import Cameras, embedded_shape
 from train.experiments.run import run_experiment
 from train.experiments.study import Study
 from train.methods import get_method, recipe
-from train.methods.losses import Scene, supervise
+from train.methods.losses import view_loss
 
 INFINITY = float("inf")
 ONE, TWO, SPHERE = Cameras(1), Cameras(2), Cameras(6, sphere=True)
@@ -239,53 +243,67 @@ def test_verdicts() -> None:
 
 
 @pytest.fixture
-def plate() -> Scene:
-    """A plate 0.1 behind where a camera saw one, a point for each pixel."""
+def plate() -> tuple[Tensor, Batch]:
+    """A plate 0.1 behind where a camera saw one, a point for each pixel: (1, 1, N, 3), and the camera's depth map."""
     camera = PinholeCamera.look_at((0, 0, -2), focal_px=14.0, height=28, width=28)
     across = (torch.arange(8, 20) + 0.5 - 14) / 14
     x, y = torch.meshgrid(across, across, indexing="xy")
     z = torch.full_like(x, 2.1)
-    points = torch.stack((-x * z, -y * z, z - 2), -1).reshape(1, -1, 3)
+    points = torch.stack((-x * z, -y * z, z - 2), -1).reshape(1, 1, -1, 3)
     depth = torch.full((1, 1, 28, 28), INFINITY)
     depth[..., 8:20, 8:20] = 2.0
-    return Scene(points, camera, depth)
+    one_view = PinholeCamera(camera.K[None, None], camera.cam_from_world[None, None], 28, 28)
+    return points, Batch(torch.ones(1, 1, 3, 28, 28), depth, one_view)
+
+
+def _stage(supervision: str, **settings: Any) -> StageConfig:
+    return dataclasses.replace(recipe("ours", "cpu").stage1, supervision=supervision, **settings)
 
 
 @pytest.mark.parametrize("front", ["emd", "chamfer"])
-def test_projection_losses_take_the_unit_of_the_front_constraint(plate: Scene, front: str) -> None:
-    stage = dataclasses.replace(recipe("ours", "cpu").stage1, front=front, supervision="projection")
-    value = supervise(plate, stage, step=0).loss.item()
+def test_projection_losses_have_the_unit_of_the_front_constraint(
+    plate: tuple[Tensor, Batch], front: str
+) -> None:
+    value = view_loss(*plate, _stage("projection", front=front), step=0).loss.item()
     expected = 0.1 * 144 * (56 / 28) ** 2 if front == "emd" else 100 * 0.1
     assert value == pytest.approx(expected, rel=1e-4)
-    like = supervise(plate, dataclasses.replace(stage, supervision="front"), step=0).loss.item()
-    assert (1 if front == "emd" else 2) * expected == pytest.approx(like, rel=0.15)  # chamfer: both ways
+    like = view_loss(*plate, _stage("front", front=front), step=0).loss.item()
+    assert (1 if front == "emd" else 2) * expected == pytest.approx(
+        like, rel=0.15
+    )  # chamfer: both directions
 
 
-def test_every_supervision_has_a_gradient_and_soft_ones_sharpen(plate: Scene) -> None:
-    steps = recipe("ours", "cpu").stage1.steps
+def test_every_supervision_has_a_gradient_and_soft_ones_sharpen(plate: tuple[Tensor, Batch]) -> None:
+    clouds, batch = plate
+    steps = _stage("soft").steps
     for supervision in ("front", "projection", "lin", "soft"):
-        stage = dataclasses.replace(recipe("ours", "cpu").stage1, supervision=supervision)
-        points = (plate.points + 0.02).requires_grad_()
-        logits = torch.full(points.shape[:2], 0.5).requires_grad_()
-        found = supervise(plate._replace(points=points, logits=logits), stage, step=steps)
+        points = (clouds + 0.02).requires_grad_()
+        logits = torch.full(points.shape[:3], 0.5).requires_grad_()
+        found = view_loss(points, batch, _stage(supervision), step=steps, logits=logits)
         found.loss.backward()
         assert points.grad is not None
         sideways = points.grad[..., :2].abs().max().item()
         assert (sideways > 1e-4) == (supervision in ("front", "soft")), supervision
         assert (logits.grad is not None) == (supervision == "lin")
-        assert ("matched_share" in found.shares) == (supervision == "front")
-    soft = dataclasses.replace(recipe("ours", "cpu").stage1, supervision="soft")
-    early, late = (supervise(plate, soft, step=step).loss.item() for step in (0, steps))
+        assert ("matched_share" in found.statistics) == (supervision == "front")
+    early, late = (view_loss(*plate, _stage("soft"), step=step).loss.item() for step in (0, steps))
     assert early != late
+
+
+def _lin(**settings: Any) -> FitConfig:
+    config = recipe("ours", "smoke")
+    return dataclasses.replace(
+        config, stage1=dataclasses.replace(config.stage1, supervision="lin"), **settings
+    )
 
 
 def test_points_that_do_not_exist_are_replaced_by_those_that_do() -> None:
     torch.manual_seed(0)
-    config = dataclasses.replace(recipe("ours", "smoke"), stage1=_lin(recipe("ours", "smoke").stage1))
-    model = get_method(config.system).build(config)
+    config = _lin()
+    model = get_method("ours").build(config)
     assert isinstance(model, Generator)
     assert isinstance(model.decoder, PointDecoder)
-    assert model.config == dataclasses.replace(SIZES["smoke"], existence=True)
+    assert model.config == dataclasses.replace(SIZES["smoke"], occupancy_logits=True)
     images, codes = torch.rand(2, 3, 64, 64), torch.randn(3, 2, model.code_dim)
     predicted = model.predict(images, codes)
     assert predicted.logits is not None
@@ -299,33 +317,27 @@ def test_points_that_do_not_exist_are_replaced_by_those_that_do() -> None:
     shown = model(images, codes)
     assert shown.shape == predicted.points.shape
     assert torch.equal(shown[:, :, :-1], predicted.points[:, :, 1:])
-    assert torch.equal(shown[:, :, -1], predicted.points[:, :, 1])  # the first that exists, once more
+    assert torch.equal(shown[:, :, -1], predicted.points[:, :, 1])  # the first that exists is repeated
 
 
-def test_supervision_belongs_to_our_own_system(tmp_path: Path) -> None:
-    config = dataclasses.replace(
-        recipe("ours", "smoke"), system="psgn", stage1=_lin(recipe("ours", "smoke").stage1)
-    )
-    with pytest.raises(UserError, match="supervision and visibility"):
-        get_method(config.system).build(config)
-    latent = dataclasses.replace(
-        recipe("ours", "smoke"), output_head="latent", stage1=_lin(recipe("ours", "smoke").stage1)
-    )
-    with pytest.raises(UserError, match="leave --ending at points"):
-        get_method(latent.system).build(latent)
-    with pytest.raises(ValueError, match="existence needs"):
-        build_generator(config=dataclasses.replace(SIZES["smoke"], existence=True, output_head="latent"))
+def test_supervision_belongs_to_our_own_method() -> None:
+    with pytest.raises(UserError, match="supervision"):
+        get_method("psgn").check(_lin(system="psgn"))
+    with pytest.raises(UserError, match="leave --output-head at points"):
+        get_method("ours").check(_lin(output_head="latent"))
+    with pytest.raises(ValueError, match="occupancy_logits needs"):
+        build_generator(
+            config=dataclasses.replace(SIZES["smoke"], occupancy_logits=True, output_head="latent")
+        )
 
 
-def _lin(stage):
-    return dataclasses.replace(stage, supervision="lin")
-
-
-def test_what_a_view_saw_is_what_is_measured(plate: Scene) -> None:
-    assert in_silhouette(plate.points, plate.camera, plate.depth).all()
-    assert visible_error(plate.points, plate.camera, plate.depth).item() == pytest.approx(20, rel=0.15)
-    outside = plate.points + torch.tensor([1.2, 0.0, 0.0])
-    assert in_silhouette(outside, plate.camera, plate.depth).float().mean() == pytest.approx(1 / 3)
-    assert in_silhouette(outside, plate.camera, plate.depth, margin=8).all()
-    gone = plate.points + torch.tensor([30.0, 0.0, 0.0])
-    assert not in_silhouette(gone, plate.camera, plate.depth, margin=28).any()
+def test_silhouettes_and_the_visible_part_are_those_of_the_view(plate: tuple[Tensor, Batch]) -> None:
+    clouds, (_, depth, cameras, *_) = plate
+    points, camera = clouds[0], cameras[0]
+    assert in_silhouette(points, camera, depth).all()
+    assert visible_error(points, camera, depth).item() == pytest.approx(20, rel=0.15)
+    outside = points + torch.tensor([1.2, 0.0, 0.0])
+    assert in_silhouette(outside, camera, depth).float().mean() == pytest.approx(1 / 3)
+    assert in_silhouette(outside, camera, depth, margin=8).all()
+    gone = points + torch.tensor([30.0, 0.0, 0.0])
+    assert not in_silhouette(gone, camera, depth, margin=28).any()

@@ -10,7 +10,6 @@ from typing import Any, get_args
 import pytest
 import torch
 
-import train.methods
 from diffpoint import PinholeCamera, chamfer_distance, diversity_loss, splat_depth, unproject
 from diffpoint.io import read_points
 from diffpoint.visibility import METHODS as VISIBILITY_METHODS
@@ -21,7 +20,6 @@ from train.config import (
     EXACT_MEAN_EMD_FROM_PAPER,
     FitConfig,
     Profile,
-    StageConfig,
     Visibility,
     fit_config_from_json,
     scaled,
@@ -34,7 +32,7 @@ from train.evaluation.evaluate import evaluate
 from train.evaluation.inference import reconstruct
 from train.evaluation.per_shape import compare_clouds, evaluate_split
 from train.evaluation.runs import config_of, load_generator, load_predictor, read_metrics
-from train.methods import METHODS, Entry, get_method, recipe
+from train.methods import METHODS, get_method, recipe
 from train.methods.base import Step
 from train.methods.lin import fixed_depth
 from train.methods.losses import diversity_term, front_loss, pair_with_views
@@ -458,29 +456,3 @@ def test_dense_predictions_are_thinned_to_the_size_of_the_others(tiny_data: Path
 
 
 # --- a method of one's own
-
-
-def test_a_new_method_is_one_file_and_one_line(
-    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """tests/toy_method.py, as if it lay in train/methods: trained, saved, loaded, resumed and evaluated."""
-    monkeypatch.setattr(train.methods, "__path__", [*train.methods.__path__, str(Path(__file__).parent)])
-    monkeypatch.setitem(METHODS, "boxes", Entry("toy_method:Boxes", "a box for every shape"))
-    run = tmp_path / "run"
-    fit_it = ["fit", "--data", str(tiny_data), "--out", str(run), "--profile", "smoke", "--system", "boxes"]
-    assert main(fit_it) == 0
-    assert main([*fit_it, "--resume"]) == 0
-    losses = [record["loss"] for record in read_metrics(run)]
-    assert losses[-1] < 0.1 * losses[0]
-
-    config = fit_config_from_json((run / "config.json").read_text(), where="")
-    network = load_predictor(run)
-    assert config == recipe("boxes", "smoke")
-    assert isinstance(config.phases["stage1"], StageConfig)
-    assert type(network).__name__ == "BoxNetwork"
-    assert method_of(network).name == "boxes"
-    result = evaluate(run, tiny_data, seeds=(0,), views=(1, 3), progress=False)
-    fresh = evaluate_split(
-        get_method("boxes").build(config), _split(tiny_data, "boxes"), config.inference, views=1, seed=0
-    )
-    assert result["views"]["1"]["cd"] < fresh["cd"].mean()

@@ -13,7 +13,7 @@ def camera(dtype: torch.dtype = torch.float64) -> dp.PinholeCamera:
 
 
 def scene(dtype: torch.dtype = torch.float64, count: int = 80) -> tuple[torch.Tensor, ...]:
-    """Predicted clouds, logits of their points' existence, and depth maps of other clouds."""
+    """Predicted clouds, occupancy logits of their points, and depth maps of other clouds."""
     truth = tie_free_clouds(2, 120, camera(), seed=1, dtype=dtype) * 0.8
     points = tie_free_clouds(2, count, camera(), seed=2, dtype=dtype, margin=3e-4)
     logits = torch.randn(2, count, generator=torch.Generator().manual_seed(0), dtype=dtype)

@@ -55,8 +55,8 @@ def test_the_baseline_of_contributing_is_trained_and_evaluated(tiny_data, tmp_pa
     """The page's file and its line in the registry are all that a new method needs."""
     import train.methods as methods
     from train.evaluation.evaluate import evaluate
-    from train.evaluation.runs import load_predictor
-    from train.methods import weights
+    from train.evaluation.runs import load_predictor, read_metrics
+    from train.methods.weights import method_of
     from train.training.trainer import fit
 
     module, entry = python_blocks(ROOT / "CONTRIBUTING.md")
@@ -64,16 +64,16 @@ def test_the_baseline_of_contributing_is_trained_and_evaluated(tiny_data, tmp_pa
     monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(tmp_path)])
     name, value = eval("{" + entry + "}", {"Entry": methods.Entry}).popitem()
     monkeypatch.setitem(methods.METHODS, name, value)
-    weights._kinds.cache_clear()
-    try:
-        run = tmp_path / "run"
-        assert fit(tiny_data, run, methods.recipe(name, "smoke"), progress=False)
-        assert type(load_predictor(run)).__name__ == "LinearNetwork"
-        result = evaluate(run, tiny_data, seeds=[0], views=[1], progress=False)
-        assert 0 < result["views"]["1"]["cd"] < 100
-    finally:
-        weights._kinds.cache_clear()
-        methods.get_method.cache_clear()
+    run = tmp_path / "run"
+    assert fit(tiny_data, run, methods.recipe(name, "smoke"), progress=False)
+    assert fit(tiny_data, run, methods.recipe(name, "smoke"), resume=True, progress=False)
+    losses = [record["loss"] for record in read_metrics(run)]
+    assert losses[-1] < 0.8 * losses[0]
+    network = load_predictor(run)
+    assert type(network).__name__ == "LinearNetwork"
+    assert method_of(network).name == name
+    result = evaluate(run, tiny_data, seeds=[0], views=[1, 3], progress=False)
+    assert 0 < result["views"]["3"]["cd"] < 100
 
 
 @pytest.mark.slow

@@ -1,0 +1,1 @@
+"""Evaluation: metrics, retrieval baselines, inference with a trained network, and evaluation.json."""

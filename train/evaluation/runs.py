@@ -51,9 +51,8 @@ def read_split(
     progress: bool = True,
 ) -> LoadedSplit:
     """Loads a split with a configuration's map size, pooling and categories; see `load_split`."""
-    roots = [data] if isinstance(data, (str, Path)) else data
     return load_split(
-        [Path(root) for root in roots],
+        data,
         split,
         image_size=image_size,
         map_size=config.map_size,

@@ -221,10 +221,8 @@ def markdown(result: Mapping[str, Any]) -> str:
         [NAMES[name], f"{r['within_shapes']:+.2f}", f"{r['across_shapes']:+.2f}"]
         for name, r in result["correlation"].items()
     ]
-    question = ["correlation of consistency loss with", "over groups of codes, within a shape", "over shapes"]
-    return "\n".join(
-        [head, "", *markdown_lines(titles, rows), "", *markdown_lines(question, correlations), ""]
-    )
+    heads = ["correlation of consistency loss with", "over groups of codes, within a shape", "over shapes"]
+    return "\n".join([head, "", *markdown_lines(titles, rows), "", *markdown_lines(heads, correlations), ""])
 
 
 def _figure(result: Mapping[str, Any], groups: Mapping[str, np.ndarray]) -> Figure:

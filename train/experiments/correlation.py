@@ -66,15 +66,15 @@ def make(study: Study) -> Outcome:
         "over_shapes_random": {name: np.stack([g[name].mean(0) for g in groups]) for name in groups[0]},
         "within_shapes": {name: np.stack([g[name].swapaxes(0, 1) for g in groups]) for name in groups[0]},
     }
-    found = {question: {error: {} for error in _ERRORS} for question in _WORDS}
+    found = {level: {error: {} for error in _ERRORS} for level in _WORDS}
     claims = []
-    for question, arrays in values.items():
+    for level, arrays in values.items():
         for error in _ERRORS:
             for name, coefficient in COEFFICIENTS.items():
                 by_seed, means = correlate(arrays["consistency"], arrays[error], coefficient)
-                found[question][error][name] = spread(by_seed) | {"interval": interval(means)}
-                if question in _CLAIMS and (error, name) == ("cd", "spearman"):
-                    words, least = _CLAIMS[question]
+                found[level][error][name] = spread(by_seed) | {"interval": interval(means)}
+                if level in _CLAIMS and (error, name) == ("cd", "spearman"):
+                    words, least = _CLAIMS[level]
                     claims.append(claim(words, by_seed[:, None] - least, means=means - least))
     result = study.about(configs[0]) | {
         "shapes": agreed["cd"].shape[1],
@@ -156,8 +156,8 @@ def markdown(result: Mapping[str, Any]) -> str:
         "trainings and shapes."
     )
     rows = [
-        [f"{NAMES[error]}, {words}", *(_cell(result[question][error][name]) for name in COEFFICIENTS)]
-        for question, words in _WORDS.items()
+        [f"{NAMES[error]}, {words}", *(_cell(result[level][error][name]) for name in COEFFICIENTS)]
+        for level, words in _WORDS.items()
         for error in _ERRORS
     ]
     return "\n".join([head, "", *markdown_lines(["", "Pearson", "Spearman"], rows), ""])

@@ -93,7 +93,7 @@ def configs(study: Study) -> list[FitConfig]:
 
 def make(study: Study) -> Outcome:
     """For each row "reached", the share of an object's backs that are reached, and "none", the share of clouds that are
-    close to none; for the hidden part, and once more for whole clouds.
+    close to none; for the hidden part, and for whole clouds.
 
     Besides our method with 10 and 50 codes: 10 codes of the highly diverse model; the deterministic network's single
     prediction; as many random training shapes of the category; and samples of the backs themselves, which reach all.

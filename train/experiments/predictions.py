@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from diffpoint import PinholeCamera, nearest, visible_points
-from models import Generator, Predictor
+from models import Predictor
 from train.data import ShapeTree
 from train.data.batches import LoadedSplit
 from train.evaluation.examples import make_example, pick_shapes
@@ -132,7 +132,6 @@ def _figure(study: Study) -> Figure:
     config = study.config(unchanged, seed=0)
     tree = ShapeTree(study.test_tree, "test", list(config.categories) or None)
     model = study.network(config)
-    assert isinstance(model, Generator)
     examples = [
         make_example(model, shape, config, seed=0, codes=SHOWN_CODES)
         for shape in pick_shapes(tree, SHOWN_SHAPES)

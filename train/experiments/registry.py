@@ -63,6 +63,9 @@ EXPERIMENTS = {
 }
 """Name -> entry, in the order in which `all` makes them."""
 
+FORMER_NAMES = {"health": "collapse"}
+"""Names that an experiment had before -> its name; the command line accepts both."""
+
 ABOUT_ALL = {
     "list": "status of every experiment, and how long the missing trainings will take",
     "all": "makes every experiment that is not done yet",

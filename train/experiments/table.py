@@ -132,7 +132,7 @@ class Table:
     """One table.
 
     Attributes:
-        title: the question that it answers, in a line.
+        title: what it compares, in a line.
         rows: from top to bottom.
         claims: what the paper's table shows.
         category_claims: what it shows in every category; with any, the table has a line for each category.
@@ -232,8 +232,8 @@ def long_table(per_shape: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
     """A line for every row, training and shape, a column for every metric, of row -> metric -> (S, M).
 
     Example:
-        >>> long_table({"ours": {"cd": [[1.0, 3.0]]}}).groupby("row")["cd"].mean()["ours"]
-        2.0
+        >>> long_table({"ours": {"cd": [[1.0, 3.0]]}}).groupby("row")["cd"].mean().to_dict()
+        {'ours': 2.0}
     """
     lines = {
         (row, seed): pd.DataFrame({name: values[seed] for name, values in metrics.items()})

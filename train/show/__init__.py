@@ -1,0 +1,1 @@
+"""Drawing from plain data: figures, HTML pages, tables, the report. Imports nothing of the networks or the data."""

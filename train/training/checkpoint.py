@@ -42,7 +42,7 @@ def save_checkpoint(
         directory.mkdir()
         for name, network in networks.items():
             save_weights(network, directory / f"{name}.safetensors")
-        buffer = io.BytesIO()  # torch's own writer answers a full disk with a riddle
+        buffer = io.BytesIO()  # torch's own writer hides the reason when a disk is full
         torch.save(state, buffer)
         (directory / "state.pt").write_bytes(buffer.getbuffer())
     for old in checkpoints(run)[:-keep]:

@@ -72,7 +72,7 @@ def make(study: Study) -> Outcome:
         return Outcome(found, page.markdown(found), drawn)
     found["networks"] = networks.summarise(trees)
     drawn["-networks"] = networks_page.curves(found["networks"])
-    drawn["-predictions"] = networks_page.predictions(networks.examples(trees))
+    drawn["-predictions"] = networks_page.predictions(*networks.examples(trees))
     return Outcome(found, "\n".join((page.markdown(found), networks_page.markdown(found["networks"]))), drawn)
 
 

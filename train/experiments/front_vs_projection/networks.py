@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from diffpoint import PinholeCamera, farthest_point_sample, nearest, visible_points
+from diffpoint import farthest_point_sample, nearest, visible_points
 from models import Predictor
 from train.config import FitConfig, InferenceConfig, StageConfig, Supervision, fit_config_from_json
 from train.data.batches import Batch, LoadedSplit
@@ -98,7 +99,7 @@ TRAININGS: dict[str, Training] = {
 def configs(study: Study) -> list[FitConfig]:
     """All trainings of the study, seed by seed."""
     return [
-        study.config(lambda config, t=training, s=single: t.config(config, single=s), seed=seed)
+        study.config(functools.partial(training.config, single=single), seed=seed)
         for seed in range(study.seeds)
         for single in (True, False)
         for training in TRAININGS.values()
@@ -114,15 +115,14 @@ def single_views(model: Predictor, test: LoadedSplit, *, seed: int) -> Metrics:
     that it sees (1: as dense as behind); "imbalance": which share of the points would have to move to another of 32
     parts of the surface for all parts to be as dense (0 to 1).
     """
-    answered = sample_predictions(model, test, codes=1, seed=seed)
+    predicted = sample_predictions(model, test, codes=1, seed=seed)
     return concatenate(
-        [single_view_metrics(made[0], test.points[shapes], shown) for shapes, shown, made in answered]
+        [single_view_metrics(made[0], test.points[shapes], shown) for shapes, shown, made in predicted]
     )
 
 
 def single_view_metrics(clouds: Tensor, true: Tensor, shown: Batch) -> Metrics:
-    """The metrics of `single_views` of clouds (B, N, 3) against the ground true (B, P, 3), of which one view each is
-    shown."""
+    """`single_views` of clouds (B, N, 3) with the ground truth (B, P, 3) and the one view of each that is shown."""
     errors = cloud_errors(clouds, true)
     return {
         "visible": visible_error(clouds, shown.camera, shown.depth)[:, 0],
@@ -172,29 +172,13 @@ def summarise(study: Study) -> dict[str, Any]:
         "seeds": study.seeds,
         "profile": study.profile,
         "floor": _floor(study),
-        "single": {name: _single(study, training) for name, training in TRAININGS.items()},
+        "single": {name: _summary(study, each, single=True) for name, each in TRAININGS.items()},
         "many": {
-            name: _many(study, training)
-            for name, training in TRAININGS.items()
-            if training.visibility == "zbuffer"
+            name: _summary(study, each, single=False)
+            for name, each in TRAININGS.items()
+            if each.visibility == "zbuffer"
         },
     }
-
-
-class Examples(NamedTuple):
-    """Held-out shapes, and predictions for one image of them after stage 1 with each loss.
-
-    Attributes:
-        images: (M, 3, H, W) in [0, 1].
-        camera: (M,) theirs.
-        true: (M, P, 3).
-        clouds: name in `TRAININGS` -> (M, N, 3).
-    """
-
-    images: Tensor
-    camera: PinholeCamera
-    true: Tensor
-    clouds: dict[str, Tensor]
 
 
 def _networks(study: Study) -> list[tuple[FitConfig, Literal[1, 2]]]:
@@ -206,21 +190,26 @@ def _networks(study: Study) -> list[tuple[FitConfig, Literal[1, 2]]]:
 
 
 @torch.no_grad()
-def examples(study: Study, *, count: int = 3) -> Examples:
-    """Predictions of the first training with each loss; the shapes are spread over the test split."""
-    clouds: dict[str, Tensor] = {}
-    for name, training in TRAININGS.items():
-        config = study.config(lambda c, t=training: t.config(c, single=True), seed=0)
-        test = study.split(config, "test")
-        shapes = torch.linspace(0, len(test) - 1, min(count, len(test))).long()
+def examples(study: Study, *, count: int = 3) -> tuple[Batch, Tensor, dict[str, Tensor]]:
+    """Predictions after stage 1 of the first training with each loss.
+
+    Returns:
+        Shapes (M, with one view) spread over the test split, their ground truth (M, P, 3), and for each of `TRAININGS`
+        clouds (M, N, 3).
+    """
+    trained = {
+        name: study.config(functools.partial(each.config, single=True), seed=0)
+        for name, each in TRAININGS.items()
+    }
+    test = study.split(trained["front"], "test")
+    shapes = torch.linspace(0, len(test) - 1, min(count, len(test))).long()
+    seen = test.batch(shapes, torch.zeros(len(shapes), 1, dtype=torch.long))
+    clouds = {}
+    for name, config in trained.items():
         model = study.network(config, stage=1)
-        seen = test.batch(shapes, torch.zeros(len(shapes), 1, dtype=torch.long))
         codes = torch.randn(1, len(shapes), model.code_dim, generator=torch.Generator().manual_seed(0))
         clouds[name] = model(seen.images[:, 0], codes)[0]
-    camera = PinholeCamera(
-        seen.camera.K[:, 0], seen.camera.cam_from_world[:, 0], seen.camera.height, seen.camera.width
-    )
-    return Examples(seen.images[:, 0], camera, test.points[shapes], clouds)
+    return seen, test.points[shapes], clouds
 
 
 def _floor(study: Study) -> dict[str, float]:
@@ -237,27 +226,15 @@ def _floor(study: Study) -> dict[str, float]:
     return {name: values.mean().item() for name, values in concatenate(found).items()}
 
 
-def _single(study: Study, training: Training) -> dict[str, Any]:
-    """Training that begins with single views: after stage 1 and after stage 2, curves, and whether it converged."""
-    runs = [study.config(lambda c: training.config(c, single=True), seed=seed) for seed in range(study.seeds)]
-    return {
-        "steps": [runs[0].stage1.steps, runs[0].stage2.steps],
-        "stage1": _over_seeds([_measured(study, config, 1) for config in runs]),
-        "stage2": _over_seeds([_measured(study, config, 2) for config in runs]),
-        "curves": [_curve(study, config, 1) for config in runs],
+def _summary(study: Study, training: Training, *, single: bool) -> dict[str, Any]:
+    """Steps of the stages that are trained, metrics after each, and the curves of the first with a verdict."""
+    runs = study.configs(lambda config: training.config(config, single=single))
+    stages: tuple[Literal[1, 2], ...] = (1, 2) if single else (2,)
+    after = {
+        f"stage{stage}": _over_seeds([_measured(study, config, stage) for config in runs]) for stage in stages
     }
-
-
-def _many(study: Study, training: Training) -> dict[str, Any]:
-    """Training with all views from the first step."""
-    runs = [
-        study.config(lambda c: training.config(c, single=False), seed=seed) for seed in range(study.seeds)
-    ]
-    return {
-        "steps": [runs[0].stage2.steps],
-        "stage2": _over_seeds([_measured(study, config, 2) for config in runs]),
-        "curves": [_curve(study, config, 2) for config in runs],
-    }
+    steps = [runs[0].stages[stage - 1].steps for stage in stages]
+    return {"steps": steps, **after, "curves": [_curve(study, config, stages[0]) for config in runs]}
 
 
 def _measured(study: Study, config: FitConfig, stage: Literal[1, 2]) -> dict[str, float]:
@@ -265,8 +242,8 @@ def _measured(study: Study, config: FitConfig, stage: Literal[1, 2]) -> dict[str
     alone = study.measure(
         config, "single views", lambda m, d: single_views(m, d, seed=config.seed), stage=stage
     )
-    concatenate = study.reconstruction_metrics(config, _RANDOM, stage=stage, views=_VIEWS)
-    both = {**alone, "cd": concatenate["cd"], "fps_cd": concatenate["fps_cd"]}
+    joined = study.reconstruction_metrics(config, _RANDOM, stage=stage, views=_VIEWS)
+    both = {**alone, "cd": joined["cd"], "fps_cd": joined["fps_cd"]}
     return {name: values.mean().item() for name, values in both.items()}
 
 

@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from diffpoint import PinholeCamera
-from train.experiments.front_vs_projection.networks import TRAININGS, Examples
+from train.data.batches import Batch
+from train.experiments.front_vs_projection.networks import TRAININGS
 from train.experiments.statistics import spread_text, trainings
 from train.show import figures
 from train.show.tables import markdown_lines
@@ -134,9 +136,9 @@ def _draw_band(
     axes.plot(steps, values.mean(0), color=colour, lw=1.6, label=label)
 
 
-def predictions(found: Examples) -> Figure:
-    """Predictions for single views after training with each loss, from the image's side and a quarter turn away."""
-    images, camera, true, clouds = found
+def predictions(seen: Batch, true: Tensor, clouds: Mapping[str, Tensor]) -> Figure:
+    """What `networks.examples` gives, from the image's side and a quarter turn away."""
+    images = seen.images[:, 0]
     columns = {"ground truth": true} | {TRAININGS[name].name: made for name, made in clouds.items()}
     figure = Figure(
         figsize=(1.9 * (len(columns) + 1), 3.6 * len(images) + 0.9), layout="constrained", dpi=110
@@ -153,7 +155,8 @@ def predictions(found: Examples) -> Figure:
         lower[0].axis("off")
         for place, (title, made) in enumerate(columns.items(), start=1):
             colours = figures.TRUE if place == 1 else figures.PREDICTED
-            for axes, eye in zip((upper, lower), (camera[shape], _beside(camera[shape])), strict=True):
+            camera = seen.camera[shape][0]
+            for axes, eye in zip((upper, lower), (camera, _beside(camera)), strict=True):
                 figures.draw_cloud(axes[place], made[shape], eye, colours=colours)
             if shape == 0:
                 upper[place].set_title("\n".join(title.split(", ")), fontsize=8)
