@@ -25,10 +25,10 @@ from tests.photographs import as_jpeg, surface_for, take
 from train.config import InferenceConfig
 from train.data.ambiguity_check import AmbiguousObject
 from train.data.batches import Batch, LoadedSplit
-from train.data.embree import has_embree
 from train.data.families.chair import CHAIR
 from train.data.photos import convert_photos
 from train.data.procedural import generate
+from train.data.rays import has_embree
 from train.data.solids import Solid, box, sample_union, surface_of
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate

@@ -87,6 +87,8 @@ def map_unordered(
         KeyboardInterrupt: Ctrl-C, or SIGTERM while there are workers.
         UserError: a result is an `OSError` which says that nothing more can be written.
     """
+    if os.name == "nt":
+        processes = 1  # workers get their pipe in a way that Windows does not have
     if processes is None:
         processes = min(os.cpu_count() or 1, len(jobs) // jobs_per_process)
     if processes > 1:

@@ -111,27 +111,22 @@ class ShapeViews:
             residuals.append(np.abs(depth[nearest] - seen)[np.isfinite(seen)])
             full = np.flatnonzero(self._cells[view])
             covered.append(np.isin(full, cells).mean() if full.size else 1.0)
+        off = (
+            view
+            for view, (share, each) in enumerate(zip(inside, residuals, strict=True))
+            if share < _VIEW_INSIDE or (each.size and np.median(each) > _VIEW_RESIDUAL)
+        )
         errors = np.concatenate(residuals)
-        medians = [np.median(each) if each.size else 0.0 for each in residuals]
-        off = [
-            share < _VIEW_INSIDE or median > _VIEW_RESIDUAL
-            for share, median in zip(inside, medians, strict=True)
-        ]
+        residual = float(np.median(errors)) if errors.size else np.inf
         if np.isnan(self.depth).any():
-            residual = float("nan")
-        else:
-            residual = float(np.median(errors)) if errors.size else float("inf")
+            residual = np.nan
         return Consistency(
-            self.id,
-            float(np.mean(inside)),
-            residual,
-            float(np.mean(covered)),
-            off.index(True) if any(off) else None,
+            self.id, float(np.mean(inside)), residual, float(np.mean(covered)), next(off, None)
         )
 
 
 def measure_consistency(shape: Shape) -> Consistency:
-    """Projects the cloud into every view and compares it with mask and depth."""
+    """How well the cloud fits masks and depth maps, as the cameras have it."""
     return ShapeViews(shape).consistency()
 
 
@@ -151,26 +146,22 @@ SAMPLE = 6
 _INSIDE, _RESIDUAL = 0.96, 0.03
 """Limits by which a shape fits a convention; lower than those of `data check`, for trees with inexact cameras."""
 _OPENGL = np.diag([1.0, -1.0, -1.0])
-_AXES = "xyz"
+_Y_TO_Z_UP = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # what Blender does to an OBJ file
 
-
-def _turns() -> list[np.ndarray]:
-    """The 48 ways to name the axes anew: what is likely first, the mirrored ones last."""
-    likely = [
-        np.eye(3),
-        np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-        np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    ]
-    every = [
+TURNS = sorted(
+    (
         np.diag(signs) @ np.eye(3)[list(order)]
         for order in itertools.permutations(range(3))
         for signs in itertools.product((1.0, -1.0), repeat=3)
-    ]
-    rest = [turn for turn in every if not any(np.array_equal(turn, known) for known in likely)]
-    return likely + sorted(rest, key=lambda turn: -np.linalg.det(turn))
-
-
-TURNS = _turns()
+    ),
+    key=lambda turn: (
+        -np.linalg.det(turn).round(),
+        not np.array_equal(turn, np.eye(3)),
+        not np.array_equal(turn, _Y_TO_Z_UP),
+        not np.array_equal(turn.T, _Y_TO_Z_UP),
+    ),
+)
+"""The 48 ways to name the axes anew: what is likely first, the mirrored ones last."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -252,7 +243,25 @@ def _frame(turn: np.ndarray, flip: np.ndarray, shapes: Sequence[Shape]) -> Frame
     else:
         to_world = next(each for each in TURNS[:24] if np.array_equal(np.round(each @ camera_up), y_up))
     turn_cloud = to_world @ turn
-    return Frame(turn_cloud, to_world, flip, _verdict(turn, flip, turn_cloud, to_world, cloud_up, camera_up))
+    found = [] if proper else ["clouds are mirrored"]
+    if np.array_equal(turn, np.eye(3)):
+        found.append(f"clouds and cameras are in one frame, {_name(cloud_up)} up")
+    else:
+        found.append(f"clouds are {_name(cloud_up)}-up, cameras expect {_name(camera_up)}-up")
+        if np.array_equal(cloud_up, camera_up):
+            found[-1] += f", turned to each other: cloud {describe(turn)}"
+    changes = []
+    if not np.array_equal(turn_cloud, np.eye(3)):
+        changes.append(f"clouds are turned, (x, y, z) -> {describe(turn_cloud)}")
+    if not np.array_equal(to_world, np.eye(3)):
+        changes.append(f"cameras are turned, their world (x, y, z) -> {describe(to_world)}")
+    if not np.array_equal(flip, np.eye(3)):
+        found.append("cameras look along -z (OpenGL, Blender)")
+        changes.append("cameras get OpenCV's axes")
+    verdict = "; ".join(found)
+    if changes:
+        verdict += f": {' and '.join(changes)} when they are read"
+    return Frame(turn_cloud, to_world, flip, verdict)
 
 
 def _camera_up(shapes: Sequence[Shape], flip: np.ndarray) -> np.ndarray:
@@ -263,36 +272,6 @@ def _camera_up(shapes: Sequence[Shape], flip: np.ndarray) -> np.ndarray:
     return np.sign(up[axis]) * np.eye(3)[axis]
 
 
-def _verdict(
-    turn: np.ndarray,
-    flip: np.ndarray,
-    turn_cloud: np.ndarray,
-    to_world: np.ndarray,
-    cloud_up: np.ndarray,
-    camera_up: np.ndarray,
-) -> str:
-    found = []
-    if np.linalg.det(turn) < 0:
-        found.append("clouds are mirrored")
-    if np.array_equal(turn, np.eye(3)):
-        found.append(f"clouds and cameras are in one frame, {_name(cloud_up)} up")
-    else:
-        found.append(f"clouds are {_name(cloud_up)}-up, cameras expect {_name(camera_up)}-up")
-        if np.array_equal(cloud_up, camera_up):
-            found[-1] += f", turned to each other: cloud {describe(turn)}"
-    if not np.array_equal(flip, np.eye(3)):
-        found.append("cameras look along -z (OpenGL, Blender)")
-    changes = []
-    if not np.array_equal(turn_cloud, np.eye(3)):
-        changes.append(f"clouds are turned, (x, y, z) -> {describe(turn_cloud)}")
-    if not np.array_equal(to_world, np.eye(3)):
-        changes.append(f"cameras are turned, their world (x, y, z) -> {describe(to_world)}")
-    if not np.array_equal(flip, np.eye(3)):
-        changes.append("cameras get OpenCV's axes")
-    line = "; ".join(found)
-    return f"{line}: {' and '.join(changes)} when they are read" if changes else line
-
-
 def describe(turn: np.ndarray) -> str:
     """A turn (3, 3) by the axes that it puts in place of x, y and z.
 
@@ -300,9 +279,8 @@ def describe(turn: np.ndarray) -> str:
         >>> describe(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
         '(x, -z, y)'
     """
-    names = [("-" if row.min() < 0 else "") + _AXES[int(np.argmax(np.abs(row)))] for row in turn]
-    return f"({', '.join(names)})"
+    return f"({', '.join(map(_name, turn))})"
 
 
 def _name(axis: np.ndarray) -> str:
-    return ("-" if axis.min() < 0 else "") + _AXES[int(np.argmax(np.abs(axis)))]
+    return ("-" if axis.min() < 0 else "") + "xyz"[int(np.argmax(np.abs(axis)))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -125,9 +126,7 @@ def _title(text: str) -> np.ndarray:
 
 def _arranged(strips: Sequence[np.ndarray]) -> np.ndarray:
     """Strips below each other, in as many columns as keep the sheet about as wide as high."""
-    columns = 1
-    while -(-len(strips) // columns) > _TALLEST * columns:
-        columns += 1
+    columns = math.ceil(math.sqrt(len(strips) / _TALLEST))
     height = -(-len(strips) // columns)
     blank = np.full_like(strips[0], 255)
     padded = [*strips, *[blank] * (columns * height - len(strips))]
@@ -191,10 +190,13 @@ def _row(category: str, seed: int) -> np.ndarray:
     cone = FAMILIES[category].cone
     if cone is None:
         shapes = [variants_of(category, 2 * seed + k)[0] for k in range(2)]
-        return _side_by_side([_seen_from(solids, _SHAPE_VIEWS) for solids in shapes])
-    variants = variants_of(category, seed)
-    front = _seen_from(variants[0], ((cone.azimuth_deg, cone.elevation_deg),))
-    return _side_by_side([front, *(_seen_from(solids, _VARIANT_VIEWS) for solids in variants)])
+        pictures = [_seen_from(solids, _SHAPE_VIEWS) for solids in shapes]
+    else:
+        variants = variants_of(category, seed)
+        front = _seen_from(variants[0], ((cone.azimuth_deg, cone.elevation_deg),))
+        pictures = [front, *(_seen_from(solids, _VARIANT_VIEWS) for solids in variants)]
+    rule = np.full((_FAMILY_CELL, _FAMILY_RULE, 3), 205, np.uint8)
+    return np.concatenate([part for picture in pictures for part in (rule, picture)][1:], axis=1)
 
 
 def _seen_from(solids: list[Solid], angles: Sequence[tuple[float, float]]) -> np.ndarray:
@@ -203,9 +205,3 @@ def _seen_from(solids: list[Solid], angles: Sequence[tuple[float, float]]) -> np
         Renderer(surface_of(solids)).render(orbit_camera(azimuth_deg, elevation_deg, _FAMILY_CELL)).images
     )
     return np.concatenate(list(images), axis=1)
-
-
-def _side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    rule = np.full((_FAMILY_CELL, _FAMILY_RULE, 3), 205, np.uint8)
-    parts = [part for picture in pictures for part in (rule, picture)]
-    return np.concatenate(parts[1:], axis=1)

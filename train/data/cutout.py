@@ -206,13 +206,14 @@ def find_foreground(pixels: np.ndarray) -> Foreground:
     light = (pixels * paper).sum(2) / np.maximum((paper * paper).sum(2), 1e-6)
     hue = np.abs(pixels - light[..., None] * paper).max(2)
     tone = pixels.mean(2)
-    noise = _noise(tone)
+    # Its standard deviation: of what a 3 x 3 mean does not explain, over most of the picture.
+    noise = float(1.4826 * np.median(np.abs(tone - _mean3(tone))) / np.sqrt(8 / 9))
     same_light = _SAME_LIGHT + 2 * noise / float(np.median(paper))
     open_ground = ~_sharp_edges(tone, noise) & ~_sharp_edges(hue, noise)
     open_ground &= (_mean3(hue) < _HUE + 3 * noise) & (light > _DARKEST_SHADOW) & (light < 1 + 2 * same_light)
     like_paper = open_ground & (np.abs(_mean3(light) - 1) < same_light)
 
-    background = _spread(like_paper, _rim(like_paper))
+    background = _spread(like_paper, np.pad(np.zeros(tone[1:-1, 1:-1].shape, bool), 1, constant_values=True))
     background |= _seen_through(like_paper & ~background, light)
     background = _in_shadow(background, open_ground)
     background = _spread(like_paper | background, background)
@@ -220,7 +221,8 @@ def find_foreground(pixels: np.ndarray) -> Foreground:
     share = mask.mean()
     if share < _SMALLEST:
         raise NotPlain("nothing stands out from it")
-    cut = _touched(mask)
+    sides = {"left": mask[:, :2], "top": mask[:2], "right": mask[:, -2:], "bottom": mask[-2:]}
+    cut = tuple(name for name, strip in sides.items() if strip.any())
     if len(cut) > 2:
         raise NotPlain(
             f"what differs from it reaches the {', the '.join(cut)} of the picture; two backgrounds?"
@@ -259,7 +261,15 @@ def _fit_paper(pixels: np.ndarray) -> np.ndarray:
         weights, *_ = np.linalg.lstsq(terms[:, chosen].T, coarse[chosen], rcond=None)
         paper, degree = np.tensordot(terms, weights, (0, 0)), next_degree
         if degree == 2 and among is border:
-            _check_plain(np.abs(coarse - paper).max(2)[border])
+            off = np.abs(coarse - paper).max(2)[border]
+            inliers = off < _FAR
+            if inliers.mean() < _FEWEST_INLIERS:
+                raise NotPlain(
+                    f"{1 - inliers.mean():.0%} of the border differs from any one colour under even light"
+                )
+            texture = float(np.median(off[inliers]))
+            if texture > _MOST_TEXTURE:
+                raise NotPlain(f"the border is textured, its brightness varies by {texture:.0%}")
     full = np.tensordot(_terms(pixels.shape[0], pixels.shape[1], degree), weights, (0, 0))
     return np.clip(full, 0.02, 1.0).astype(np.float32)
 
@@ -270,21 +280,6 @@ def _terms(height: int, width: int, degree: int) -> np.ndarray:
     return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)])
 
 
-def _check_plain(off: np.ndarray) -> None:
-    inliers = off < _FAR
-    if inliers.mean() < _FEWEST_INLIERS:
-        raise NotPlain(f"{1 - inliers.mean():.0%} of the border differs from any one colour under even light")
-    texture = float(np.median(off[inliers]))
-    if texture > _MOST_TEXTURE:
-        raise NotPlain(f"the border is textured, its brightness varies by {texture:.0%}")
-
-
-def _noise(tone: np.ndarray) -> float:
-    """Standard deviation of the noise: of what a 3 x 3 mean does not explain, over most of the picture."""
-    rough = tone - _mean3(tone)
-    return float(1.4826 * np.median(np.abs(rough)) / np.sqrt(8 / 9))
-
-
 def _sharp_edges(tone: np.ndarray, noise: float) -> np.ndarray:
     """Pixels at edges that are sharp, however faint: seen through a wider filter they lose their slope."""
     fine = ndimage.gaussian_gradient_magnitude(tone, 1.0)
@@ -293,12 +288,6 @@ def _sharp_edges(tone: np.ndarray, noise: float) -> np.ndarray:
     faintest = max(_FAINTEST_EDGE, 1.2 * noise)
     edges = _flooded(sharp & (fine > faintest), sharp & (fine > 0.5 * faintest), corners=True)
     return _large(edges, _SHORTEST_EDGE)
-
-
-def _rim(picture: np.ndarray) -> np.ndarray:
-    rim = np.ones_like(picture, bool)
-    rim[1:-1, 1:-1] = False
-    return rim
 
 
 def _spread(like_paper: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -356,11 +345,6 @@ def _large(mask: np.ndarray, pixels: float) -> np.ndarray:
     """Without the parts that have fewer pixels."""
     labels, _ = _labelled(mask, corners=True)
     return mask & (np.bincount(labels.ravel()) >= pixels)[labels]
-
-
-def _touched(mask: np.ndarray) -> tuple[str, ...]:
-    sides = {"left": mask[:, :2], "top": mask[:2], "right": mask[:, -2:], "bottom": mask[-2:]}
-    return tuple(name for name, strip in sides.items() if strip.any())
 
 
 # scipy's operations with one convention: (H, W) bool in and out, square windows, borders as scipy's defaults.

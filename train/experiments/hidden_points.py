@@ -13,8 +13,8 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, visible_points
 from diffpoint.visibility import Method
-from train.data.embree import EmbreeCaster
 from train.data.procedural import variants_of
+from train.data.rays import EmbreeCaster
 from train.data.render import draw_camera
 from train.data.solids import sample_union, surface_of
 from train.data.surface import Surface
