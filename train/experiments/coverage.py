@@ -27,7 +27,7 @@ from train.data.render import Renderer, orbit_camera
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
 from train.experiments.frame import Experiment, Outcome
-from train.experiments.paper import highly_diverse, without_codes
+from train.experiments.paper import without_codes
 from train.experiments.statistics import (
     claim,
     claim_lines,
@@ -39,6 +39,7 @@ from train.experiments.statistics import (
 )
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, unchanged
+from train.methods.ours import highly_diverse
 from train.processes import progress_bar
 from train.show import figures
 from train.show.tables import markdown_lines
