@@ -16,7 +16,7 @@ from train.data import ShapeTree
 from train.data.batches import LoadedSplit
 from train.evaluation.examples import make_example, pick_shapes
 from train.evaluation.per_shape import concatenate, sample_predictions
-from train.experiments.frame import Experiment, Outcome
+from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.statistics import claim, spreads, stacked, trainings
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
@@ -113,27 +113,19 @@ def markdown(result: Mapping[str, Any]) -> str:
         f"nearest point of another prediction. Claim: {found['words']}; it "
         f"{found['verdict'].replace('undecided', 'is undecided')}."
     )
-    rows = [
-        [
-            name,
-            str(row["shapes"]),
-            f"{row['front']:.2f}",
-            f"{row['back']:.2f}",
-            " / ".join(f"{ratio:.2f}" for ratio in row["ratio_by_seed"]),
-            f"{row['ratio_surface']:.2f}",
-        ]
-        for name, row in {"all": result["all"], **result["categories"]}.items()
-    ]
+    rows = []
+    for name, row in {"all": result["all"], **result["categories"]}.items():
+        ratios = " / ".join(f"{ratio:.2f}" for ratio in row["ratio_by_seed"])
+        front, back, of_surface = (f"{row[column]:.2f}" for column in ("front", "back", "ratio_surface"))
+        rows.append([name, str(row["shapes"]), front, back, ratios, of_surface])
     columns = ["", "shapes", "front", "back", "back / front, by seed", "of the surface"]
-    return "\n".join([head, "", *markdown_lines(columns, rows), ""])
+    return markdown_page(head, markdown_lines(columns, rows))
 
 
 def _figure(study: Study) -> Figure:
     config = study.config(unchanged, seed=0)
     tree = ShapeTree(study.test_tree, "test", list(config.categories) or None)
     model = study.network(config)
-    examples = [
-        make_example(model, shape, config, seed=0, codes=SHOWN_CODES)
-        for shape in pick_shapes(tree, SHOWN_SHAPES)
-    ]
+    shapes = pick_shapes(tree, SHOWN_SHAPES)
+    examples = (make_example(model, shape, config, seed=0, codes=SHOWN_CODES) for shape in shapes)
     return figures.predictions_figure(*examples)
