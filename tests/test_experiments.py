@@ -445,7 +445,7 @@ def test_one_page_of_all_results(fresh: Study) -> None:
     assert "1 claims are tested: 1 holds" in text
     assert "| views | a < b | +0.50 [+0.50, +0.50] |  | holds |" in text
     order = [
-        EXPERIMENTS["views"].description, "the page", "More views are better.", "out/views.png", "out/views-more.png",
+        EXPERIMENTS["views"], "the page", "More views are better.", "out/views.png", "out/views-more.png",
         "experiment views --data tiny --out OUT --profile smoke --seeds 1",
     ]  # fmt: skip
     places = [text.index(words) for words in order]

@@ -45,7 +45,7 @@ def write_page(out: Path) -> Path:
         if folder != out:
             lines += ["", f"## Data: {folder.name}", "", _text(folder / "README.md")]
         for name, result in found.items():
-            description = EXPERIMENTS[name].description
+            description = EXPERIMENTS[name]
             lines += ["", f"{'##' if folder == out else '###'} {name}", "", f"*{description}*", ""]
             lines += [_section(folder, name, result, page.parent)]
     write_text(page, "\n".join([*lines, ""]))

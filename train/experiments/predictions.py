@@ -36,6 +36,7 @@ def make(study: Study) -> Outcome:
     test = study.split(configs[0], "test")
     per_shape = stacked([_measured(study, config) for config in configs])
     categories = np.array(test.categories)
+    words = f"the back varies more than {LEAST_RATIO} times as much as the front"
     result = study.about(configs[0]) | {
         "shapes": len(test),
         "codes": CODES,
@@ -43,12 +44,7 @@ def make(study: Study) -> Outcome:
         "categories": {
             name: _summary(per_shape, categories == name) for name in dict.fromkeys(test.categories)
         },
-        "claims": [
-            claim(
-                f"the back varies more than {LEAST_RATIO} times as much as the front",
-                per_shape["back"] - LEAST_RATIO * per_shape["front"],
-            )
-        ],
+        "claims": [claim(words, per_shape["back"] - LEAST_RATIO * per_shape["front"])],
     }
     return Outcome(result, markdown(result), {"": _figure(study)})
 

@@ -41,13 +41,8 @@ Change = Callable[[FitConfig], FitConfig]
 
 # Fields that do not change the weights. The seed has a place of its own in the name of a run.
 _NOT_OF_THE_WEIGHTS = (
-    "inference",
-    "seed",
-    "log_every",
-    "picture_every",
-    "checkpoint_every",
-    "keep_checkpoints",
-)
+    "inference", "seed", "log_every", "picture_every", "checkpoint_every", "keep_checkpoints",
+)  # fmt: skip
 # The error of a method on its training shapes is measured on so many of them.
 _SOME_TRAINING_SHAPES = 100
 
@@ -85,14 +80,10 @@ class Study:
     _splits: dict[tuple, LoadedSplit] = dataclasses.field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        for name, least, reason in (
-            ("seeds", 1, ""),
-            ("limit", 2, ", for a spread over shapes"),
-            ("processes", 1, ""),
-        ):
+        for name, least in (("seeds", 1), ("limit", 2), ("processes", 1)):  # 2 shapes, for a spread over them
             value = getattr(self, name)
             if value is not None and value < least:
-                raise UserError(f"--{name} must be at least {least}{reason}; got {value}")
+                raise UserError(f"--{name} must be at least {least}; got {value}")
 
     # Configurations and data
 
@@ -107,9 +98,8 @@ class Study:
 
     def on_trees(self) -> Study:
         """The same with only those of its data that are data trees, on which networks can be trained."""
-        return dataclasses.replace(
-            self, data=tuple(root for root in self.data if (root / "data_list").is_dir())
-        )
+        trees = tuple(root for root in self.data if (root / "data_list").is_dir())
+        return dataclasses.replace(self, data=trees)
 
     def need_data(self) -> None:
         """Raises a UserError if there are no data."""
@@ -324,13 +314,8 @@ class Study:
         if min(self.processes, len(calls)) < 2:
             return
         alone = dataclasses.replace(self, progress=False, processes=1, _splits={})
-        run_in_processes(
-            functools.partial(_call, function),
-            [(alone, *call) for call in calls],
-            processes=self.processes,
-            title=title,
-            progress=self.progress,
-        )
+        call, given = functools.partial(_call, function), [(alone, *each) for each in calls]
+        run_in_processes(call, given, processes=self.processes, title=title, progress=self.progress)
 
     def about(self, config: FitConfig) -> dict[str, Any]:
         """What every result states of its making: profile, data, seeds, and the networks' configuration."""
