@@ -11,6 +11,7 @@ Every setting is measured on the same shapes, views and first random codes. Besi
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import itertools
 from collections.abc import Mapping
@@ -98,10 +99,11 @@ def make(study: Study) -> Outcome:
     study.measure_all(_measured, [(run, each) for each in everything])
     bar = progress_bar(everything, title="settings", unit="measurement", progress=study.progress)
     found = {each: _measured(study, run, each) for each in bar}
-    values = {name: concatenate([found[each] for each in every]) for name, every in wanted.items()}
     arrays = {
-        name: {metric: each.double().numpy() for metric, each in metrics.items()}
-        for name, metrics in values.items()
+        name: {
+            metric: each.double().numpy() for metric, each in concatenate([found[e] for e in every]).items()
+        }
+        for name, every in wanted.items()
     }
     groups = arrays.pop("groups")
     result: dict[str, Any] = (
@@ -134,12 +136,8 @@ def _measured(study: Study, run: Path, what: _Measurement) -> Metrics:
     settings, views, seed, code_seeds = what
 
     def measure() -> Metrics:
-        return stack_seeds(
-            [
-                evaluate_split(opened.model, test, settings, views=views, seed=seed, code_seed=draw)
-                for draw in code_seeds
-            ]
-        )
+        evaluate = functools.partial(evaluate_split, opened.model, test, settings, views=views, seed=seed)
+        return stack_seeds([evaluate(code_seed=draw) for draw in code_seeds])
 
     # The name of a run is not enough: any run can be given, and one that trains on gets other weights.
     weights = hashlib.sha256()

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from train.config import FitConfig, InferenceConfig, scaled
@@ -92,11 +93,9 @@ class Row:
     source: Literal["network", "medoid", "nearest image", "truth"] = "network"
     """Of the clouds: a trained network, a retrieval baseline, or the ground truth (with a `measure` of its own)."""
     measure: Measure = reconstruction
-    """Takes the metrics."""
     critic_of: Change | None = None
     """How the training differs from the profile's whose auto-encoder a critic uses."""
     paper: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """The values in the paper."""
 
 
 Rows = Mapping[str, Mapping[str, Any]]
@@ -133,11 +132,10 @@ def rising(metric: str, *names: str) -> list[Claim]:
 def falls_more(words: str, metric: str, first: tuple[str, str], second: tuple[str, str]) -> Claim:
     """The claim that a metric falls more from one row to another than between two others."""
 
-    def gain(rows: Rows) -> Any:
-        falls = [rows[start][metric] - rows[end][metric] for start, end in (first, second)]
-        return falls[0] - falls[1]
+    def fall(rows: Rows, start: str, end: str) -> Any:
+        return rows[start][metric] - rows[end][metric]
 
-    return Claim(words, gain)
+    return Claim(words, lambda rows: fall(rows, *first) - fall(rows, *second))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -165,11 +163,10 @@ class Table:
     def config(self, row: Row, study: Study, *, seed: int) -> FitConfig:
         """How a row's method is trained."""
         config = study.config(row.change, seed=seed)
-        if not self.of_one_category:
-            return config
-        config = dataclasses.replace(config, categories=(study.category,))
-        if study.profile == "cpu" and study.steps is None:
-            return scaled(config, _CPU_STEPS_FOR_ONE_CATEGORY)
+        if self.of_one_category:
+            config = dataclasses.replace(config, categories=(study.category,))
+            if study.profile == "cpu" and study.steps is None:
+                config = scaled(config, _CPU_STEPS_FOR_ONE_CATEGORY)
         return config
 
     def cells(self, study: Study) -> Iterator[tuple[Row, FitConfig]]:
@@ -178,25 +175,17 @@ class Table:
             for row in self.rows:
                 yield row, self.config(row, study, seed=seed)
 
-    def trainings(self, study: Study) -> list[FitConfig]:
-        """Every training that the table needs, no longer than it needs it."""
-        return [training for cell in self.cells(study) for training in _trainings(*cell, study)]
-
-    def missing(self, study: Study) -> list[FitConfig]:
-        """Those of `trainings` whose metrics are not kept."""
-        return [
-            training
-            for row, config in self.cells(study)
-            if study.first_missing(lambda s, row=row, config=config: measured(s, row, config))
-            for training in _trainings(row, config, study)
-        ]
-
-
-def _trainings(row: Row, config: FitConfig, study: Study) -> list[FitConfig]:
-    """A row's network, up to the stage that is measured, and the training whose auto-encoder its critic uses."""
-    networks = [stage1_of(config) if row.stage == 1 else config] if row.source == "network" else []
-    critics = [study.config(row.critic_of, seed=config.seed)] if row.critic_of else []
-    return networks + critics
+    def trainings(self, study: Study, *, only_missing: bool = False) -> list[FitConfig]:
+        """Every training that the table needs, no longer than it needs it; or only those whose metrics are not kept."""
+        found = []
+        for row, config in self.cells(study):
+            if only_missing and not study.first_missing(functools.partial(measured, row=row, config=config)):
+                continue
+            if row.source == "network":
+                found.append(stage1_of(config) if row.stage == 1 else config)
+            if row.critic_of is not None:  # whose auto-encoder is used
+                found.append(study.config(row.critic_of, seed=config.seed))
+        return found
 
 
 def measured(study: Study, row: Row, config: FitConfig) -> Metrics:
@@ -212,14 +201,12 @@ def make(table: Table, study: Study) -> Outcome:
 
 def tabulate(table: Table, study: Study) -> dict[str, Any]:
     """Trains and measures what is missing; what NAME.json is to hold."""
-    study.train_all(table.missing(study))
+    study.train_all(table.trainings(study, only_missing=True))
     study.measure_all(measured, list(table.cells(study)))
-    per_shape = {
-        row.name: stacked(
-            [measured(study, row, table.config(row, study, seed=seed)) for seed in range(study.seeds)]
-        )
-        for row in table.rows
-    }
+    by_row: dict[str, list[Metrics]] = {}
+    for row, config in table.cells(study):
+        by_row.setdefault(row.name, []).append(measured(study, row, config))
+    per_shape = {name: stacked(metrics) for name, metrics in by_row.items()}
     config = table.config(table.rows[0], study, seed=0)
     categories = np.array(study.split(config, "test").categories)
     result: dict[str, Any] = study.about(config) | {
@@ -250,21 +237,13 @@ def _summary(row: Row, metrics: Mapping[str, np.ndarray], columns: Sequence[str]
     return found
 
 
-def _of_category(
-    table: Table, per_shape: Mapping[str, Mapping[str, np.ndarray]], mine: np.ndarray
-) -> dict[str, Any]:
+def _of_category(table: Table, per_shape: Rows, mine: np.ndarray) -> dict[str, Any]:
     """Number, means and verdicts of the shapes of a category."""
-    part = {
-        row: {name: values[:, mine] for name, values in metrics.items()} for row, metrics in per_shape.items()
-    }
-    return {
-        "shapes": int(mine.sum()),
-        "rows": {
-            row: {name: float(metrics[name].mean()) for name in table.columns if name in metrics}
-            for row, metrics in part.items()
-        },
-        "claims": _verdicts(table.category_claims, part, {}),
-    }
+    part, means = {}, {}
+    for row, metrics in per_shape.items():
+        part[row] = {name: metrics[name][:, mine] for name in table.columns if name in metrics}
+        means[row] = {name: float(values.mean()) for name, values in part[row].items()}
+    return {"shapes": int(mine.sum()), "rows": means, "claims": _verdicts(table.category_claims, part, {})}
 
 
 def _verdicts(claims: Sequence[Claim], rows: Rows, paper: Rows) -> list[dict[str, Any]]:
@@ -295,31 +274,27 @@ def markdown(result: Mapping[str, Any]) -> str:
         blocks.append(claim_lines(result["claims"]))
     agreed = {name: row["consistency"] for name, row in result["rows"].items() if "consistency" in row}
     if agreed:
-        blocks.append(
-            "Consistency loss before and after the descent, and the share of shapes for which it fell:"
+        words = "Consistency loss before and after the descent, and the share of shapes for which it fell:"
+        shares = (
+            f"- {name}: {found['searched']:.2f}, {found['descended']:.2f}, {found['lowered_share']:.1%}"
+            for name, found in agreed.items()
         )
-        blocks.append(
-            [
-                f"- {name}: {found['searched']:.2f}, {found['descended']:.2f}, {found['lowered_share']:.1%}"
-                for name, found in agreed.items()
-            ]
-        )
+        blocks += [words, [*shares]]
     return markdown_page(*blocks)
 
 
 def _cell(row: Mapping[str, Any], column: str) -> str:
     if column not in row["mean"]:
         return ""
-    paper = row["paper"].get(column)
     text = spread_text({"mean": row["mean"][column], "sd": row["sd"][column]})
-    return text if paper is None else f"{text} ({paper:.2f})"
+    return f"{text} ({row['paper'][column]:.2f})" if column in row["paper"] else text
 
 
 def _category_blocks(result: Mapping[str, Any]) -> list[str | list[str]]:
     """CD and FPS-CD of every category and row; the means over shapes and over categories below."""
     names, found = list(result["rows"]), result["categories"].values()
 
-    def cells(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    def cells(rows: Mapping[str, Any]) -> list[str]:
         return [f"{rows[name]['cd']:.2f} ({rows[name]['fps_cd']:.2f})" for name in names]
 
     lines = [
@@ -327,10 +302,7 @@ def _category_blocks(result: Mapping[str, Any]) -> list[str | list[str]]:
         for kind, each in result["categories"].items()
     ]
     over_shapes = {name: row["mean"] for name, row in result["rows"].items()}
-    over_categories = {
-        name: {column: np.mean([each["rows"][name][column] for each in found]) for column in ("cd", "fps_cd")}
-        for name in names
-    }
+    over_categories = {name: pd.DataFrame([each["rows"][name] for each in found]).mean() for name in names}
     lines.append(["mean over shapes", str(result["shapes"]), *cells(over_shapes), ""])
     lines.append(["mean over categories", "", *cells(over_categories), ""])
     words = "; ".join(claim["words"] for claim in next(iter(found))["claims"])
@@ -346,12 +318,10 @@ def figure(result: Mapping[str, Any]) -> Figure:
     drawn = Figure(figsize=(3.2 * len(columns) + 2, 0.42 * len(rows) + 1.4), layout="constrained", dpi=110)
     panels = drawn.subplots(1, len(columns), sharey=True, squeeze=False)[0]
     for axes, column in zip(panels, columns, strict=True):
-        for height, name in enumerate(rows):
-            values = result["rows"][name]["by_seed"].get(column)
-            if values is None:
-                continue
-            axes.barh(height, result["rows"][name]["mean"][column], color="#cfe8e0", height=0.6)
-            axes.plot(values, [height] * len(values), "o", color="#1f6f8b", ms=5)
+        for height, row in enumerate(result["rows"].values()):
+            if column in row["mean"]:
+                axes.barh(height, row["mean"][column], color="#cfe8e0", height=0.6)
+                axes.plot(row["by_seed"][column], [height] * result["seeds"], "o", color="#1f6f8b", ms=5)
         axes.set(xlabel=NAMES[column] + (" x100" if column != "critic" else ""))
         axes.set_xlim(min(0, axes.get_xlim()[0]), None)
         figures.plain(axes)
