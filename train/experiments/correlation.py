@@ -53,10 +53,11 @@ def make(study: Study) -> Outcome:
     study.measure_all(_measured, [(seed, views, group) for seed in seeds for group in (None, *range(GROUPS))])
     agreed = stacked([_measured(study, seed, views, None) for seed in seeds])
     groups = [stacked([_measured(study, seed, views, group) for group in range(GROUPS)]) for seed in seeds]
+    together = {name: np.stack([each[name].T for each in groups]) for name in groups[0]}  # each (S, M, G)
     values = {
         "over_shapes": agreed,
-        "over_shapes_random": {name: np.stack([g[name].mean(0) for g in groups]) for name in groups[0]},
-        "within_shapes": {name: np.stack([g[name].swapaxes(0, 1) for g in groups]) for name in groups[0]},
+        "over_shapes_random": {name: each.mean(2) for name, each in together.items()},
+        "within_shapes": together,
     }
     found = {level: {error: {} for error in _ERRORS} for level in _WORDS}
     claims = []

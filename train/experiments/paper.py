@@ -56,10 +56,9 @@ DIVERSITY = Table(
     rows=(
         *(
             Row(
-                name, change=change, stage=1, measure=ten_predictions, critic_of=with_critic,
-                paper={"diversity": theirs},
+                name, change=change, stage=1, measure=ten_predictions, critic_of=with_critic, paper={"diversity": paper}
             )
-            for name, change, theirs in (
+            for name, change, paper in (
                 ("whole clouds (EMD) + MoN", of_method("psgn-mon"), 1.65),
                 ("front constraint", without_diversity, 0.55),
                 ("front constraint + MoN", of_method("front-mon"), 2.52),
