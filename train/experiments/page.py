@@ -23,10 +23,7 @@ def write_page(out: Path) -> Path:
     no experiment may be running there meanwhile.
 
     Args:
-        out: a directory that experiments wrote into, or one with a folder for each data set.
-
-    Returns:
-        The page: OUT.md.
+        out: a directory that experiments wrote into, or one with a folder for each data set; the page is OUT.md.
 
     Raises:
         UserError: there are no results in it.

@@ -58,18 +58,12 @@ def make(study: Study) -> Outcome:
     study.train_all(configs)
     found = [[_reconstruct(study, config, each) for config in configs] for each in objects]
     losses = [stacked(by_seed)["losses"] for by_seed in found]  # of each object (S, 3)
-    result = study.about(configs[0]) | {
-        "pictures": str(study.pictures),
-        "objects": {
-            each.name: {"pictures": len(each.pictures)}
-            | {
-                step: None if np.isnan(values).any() else spread(values)
-                for step, values in zip(_STEPS, loss.T, strict=True)
-            }
-            for each, loss in zip(objects, losses, strict=True)
-        },
-        "left_out": left_out,
-    }
+    by_object: dict[str, dict[str, Any]] = {each.name: {"pictures": len(each.pictures)} for each in objects}
+    for of_object, loss in zip(by_object.values(), losses, strict=True):
+        for step, values in zip(_STEPS, loss.T, strict=True):
+            of_object[step] = None if np.isnan(values).any() else spread(values)
+    about = {"pictures": str(study.pictures), "objects": by_object, "left_out": left_out}
+    result = study.about(configs[0]) | about
     first = [by_seed[0] for by_seed in found]
     return Outcome(result, markdown(result), {"": _figure(result, objects, first)})
 
@@ -84,10 +78,8 @@ photos = Experiment(
 def read_objects(folder: Path | None) -> tuple[list[PhotographedObject], dict[str, str]]:
     """The first objects of a folder of photographs, and what was left out, with the reason.
 
-    A cut-out is taken as it is; another picture is cut out by its mask, if it has one, or from its plain background.
-
-    Args:
-        folder: as `data photos` takes or writes it: a folder of pictures for each object, or one object's.
+    The folder is one that `data photos` takes or writes, with a folder of pictures for each object, or one object's. A
+    cut-out is taken as it is; another picture is cut out by its mask, if it has one, or from its plain background.
 
     Raises:
         UserError: no folder, or not a single picture that can be used.

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, nearest, visible_points
 from models import Predictor
+from train.config import FitConfig
 from train.data import ShapeTree
 from train.data.batches import LoadedSplit
 from train.evaluation.examples import make_example, pick_shapes
@@ -52,7 +53,7 @@ def make(study: Study) -> Outcome:
 predictions = Experiment(make, lambda study: study.configs(unchanged))
 
 
-def _measured(study: Study, config: Any) -> Metrics:
+def _measured(study: Study, config: FitConfig) -> Metrics:
     def measure(model: Predictor, test: LoadedSplit) -> Metrics:
         found = sample_predictions(model, test, codes=CODES, seed=config.seed)
         return concatenate([variation(clouds, shown.camera) for _, shown, clouds in found])

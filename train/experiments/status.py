@@ -117,9 +117,8 @@ def _steps(config: FitConfig) -> int:
 def _timed(study: Study) -> dict[Path, tuple[FitConfig, float]]:
     """trained.json of each run that was trained without an interruption -> its configuration and processor seconds, the
     newest last."""
-    notes = sorted((study.out / "runs").glob("*/trained.json"), key=lambda path: path.stat().st_mtime)
     found = {}
-    for note in notes:
+    for note in sorted((study.out / "runs").glob("*/trained.json"), key=lambda path: path.stat().st_mtime):
         took, saved = json.loads(note.read_text()), note.with_name("config.json")
         if not took["continued"]:
             found[note] = fit_config_from_json(saved.read_text(), where=str(saved)), took["seconds"]

@@ -177,9 +177,7 @@ class Study:
     def train_all(self, configs: Sequence[FitConfig]) -> None:
         """Trains what is not trained yet, `processes` at once; the weights do not depend on how many.
 
-        Raises:
-            KeyboardInterrupt: as `train`.
-            UserError: one could not be trained; those that ran at the same time have been finished.
+        If one cannot be trained, those that run at the same time are finished; see `train` for interruptions.
         """
         for number in (0, 1):  # first the runs from fresh weights, then those that start from them
             parts = [part for config in configs for part in parts_of(config)[number : number + 1]]
@@ -205,6 +203,10 @@ class Study:
         return load_predictor(best_weights(run, stage) if f"stage{stage}" in config.phases else run)
 
     # Measurements
+
+    def weights_key(self, config: FitConfig) -> list[Any]:
+        """The part of a measurement's key that names a configuration's weights."""
+        return [self.run_key(config), config.seed]
 
     def kept(self, key: Sequence[object], measure: Callable[[], Metrics]) -> Metrics:
         """The metrics under a key of plain JSON values, measured now if they are not kept; see `store.kept`."""
@@ -232,10 +234,6 @@ class Study:
         run = self.weights_key(stage1_of(config) if stage == 1 else config)
         key = [*run, stage, what, split, data.fingerprint]
         return self.kept(key, lambda: function(self.network(config, stage=stage), data))
-
-    def weights_key(self, config: FitConfig) -> list[Any]:
-        """The part of a measurement's key that names a configuration's weights."""
-        return [self.run_key(config), config.seed]
 
     def reconstruction_metrics(
         self,
