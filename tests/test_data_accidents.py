@@ -12,9 +12,10 @@ import time
 import numpy as np
 import pytest
 import trimesh
+from trees import all_shapes, files_of
 
 from train.__main__ import main
-from train.data import ShapeTree, tree_files
+from train.data import tree_files
 from train.data.meshes import convert
 
 BOXES = 12
@@ -34,12 +35,6 @@ def boxes(tmp_path):
     for number in range(BOXES):
         trimesh.creation.box((1, 1 + number / 10, 2)).export(folder / f"box {number:02d}.ply")
     return folder
-
-
-def files_of(root):
-    return {
-        path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()
-    }
 
 
 def finished(out):
@@ -128,7 +123,4 @@ def test_three_million_faces_take_neither_all_memory_nor_all_day(tmp_path):
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert after.ru_utime - before.ru_utime < 120
     assert after.ru_maxrss < 3e6  # kB
-    shapes = [
-        shape for split in tree_files.SPLITS for shape in ShapeTree(tmp_path / "out", split).iter_valid()
-    ]
-    assert sorted(shape.id for shape in shapes) == ["unknown/ball", "unknown/box"]
+    assert sorted(shape.id for shape in all_shapes(tmp_path / "out")) == ["unknown/ball", "unknown/box"]

@@ -11,6 +11,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from trees import Y_TO_Z_UP, all_ids, halve, turn_clouds
 
 from diffpoint.io import read_depth, read_points, write_depth, write_points
 from train.__main__ import main
@@ -101,7 +102,7 @@ def test_each_way_to_disagree_is_seen(procedural):
 def test_problems_are_named(procedural, tmp_path):
     root = tmp_path / "data"
     shutil.copytree(procedural, root)
-    ids = [shape for split in tree_files.SPLITS for shape in ShapeTree(root, split).ids]
+    ids = all_ids(root)
     broken, moved, unlisted, absent, doubled = ids[:5]
     (tree_files.render_folder(root, broken) / "depth_2.png").write_bytes(b"no")
     camera = tree_files.render_folder(root, moved) / "camera_0.json"
@@ -125,10 +126,6 @@ def test_problems_are_named(procedural, tmp_path):
         assert [p for p in report.problems if p.startswith(shape) and what in p], (what, report.problems)
     assert len(report.problems) == 5
     assert "5 problems" in report.summary()
-
-
-def halve(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 # What is done to the folder of a shape, and what the line about it says. How files can be broken: test_data_tree.py.
@@ -182,7 +179,7 @@ def test_each_kind_of_damage_is_one_line_and_the_other_shapes_stand(procedural, 
 def test_pictures_of_another_object_and_shapes_unlike_the_rest_are_named(procedural, tmp_path):
     root = tmp_path / "data"
     shutil.copytree(procedural, root)
-    ids = [shape for split in tree_files.SPLITS for shape in ShapeTree(root, split).ids]
+    ids = all_ids(root)
     chair = next(shape for shape in ids if shape.startswith("03001627"))
     display = next(shape for shape in ids if shape.startswith("03211117"))
     chair_image = tree_files.render_folder(root, chair) / "render_2.png"
@@ -198,9 +195,7 @@ def test_pictures_of_another_object_and_shapes_unlike_the_rest_are_named(procedu
 def test_a_tree_of_ours_whose_clouds_were_turned_is_not_turned_back_in_silence(procedural, tmp_path):
     root = tmp_path / "data"
     shutil.copytree(procedural, root)
-    for cloud in (root / tree_files.CLOUDS).glob("*/*.ply"):
-        x, y, z = read_points(cloud).T
-        write_points(cloud, torch.stack((x, -z, y), 1))
+    turn_clouds(root, Y_TO_Z_UP)
     report = check_tree(root, processes=1)
     said = "clouds are z-up, cameras expect y-up; not as this program wrote them: make the data again"
     assert report.frame.verdict == said

@@ -1,5 +1,6 @@
 """Trees from elsewhere: the paper's archive and Choy's renderings, in whatever axis conventions they are."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -10,23 +11,23 @@ import scipy.io
 import torch
 import trimesh
 from PIL import Image
+from scipy.spatial.transform import Rotation
+from trees import Y_TO_Z_UP, all_shapes, four_boxes, halve, plain_surface, turn_clouds
 
 from diffpoint.camera import PinholeCamera
 from diffpoint.io import read_points, write_points
 from models import build_generator
 from train.__main__ import main
 from train.data import Shape, ShapeTree, tree_files
-from train.data.axis_frames import TURNS, describe, find_frame
 from train.data.check import check_tree
-from train.data.choy_layout import cam_from_world, pictures_of
+from train.data.consistency import TURNS, describe, find_frame
+from train.data.layouts import cam_from_world, pictures_of
 from train.data.procedural import generate
 from train.data.render import Renderer, draw_camera
-from train.data.surface import Surface
 from train.data.tree import frame_of
 from train.errors import UserError
 from train.methods.weights import save_weights
 
-Y_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # what Blender does to an OBJ file
 CV_FROM_BLENDER = np.diag([1.0, -1, -1])
 
 
@@ -37,7 +38,7 @@ def ours(tmp_path_factory):
     return out
 
 
-def as_archive(ours, root, *, cloud=None, world=None, camera=None):
+def as_archive(ours, root, *, cloud=np.eye(3), world=np.eye(3), camera=np.eye(3)):  # noqa: B008
     """The tree as the authors lay theirs out, its clouds and cameras written down in other frames.
 
     `cloud` and `world` (3, 3) take our world to that of the clouds and of the cameras; `camera` (3, 3) takes OpenCV's
@@ -53,29 +54,23 @@ def as_archive(ours, root, *, cloud=None, world=None, camera=None):
     shutil.rmtree(root / tree_files.LISTS / "val")
     for path in (root / tree_files.RENDERS).glob("*/*/camera_*.json"):
         record = json.loads(path.read_text())
-        pose, turn = np.array(record["cam_from_world"]), np.eye(4)
-        if world is not None:
-            turn[:3, :3] = world.T
-            pose = pose @ turn
-        if camera is not None:
-            pose[:3] = camera @ pose[:3]
+        pose = np.array(record["cam_from_world"])[:3]
+        pose[:, :3] = camera @ pose[:, :3] @ world.T
+        pose[:, 3] = camera @ pose[:, 3]
         values = {
             "K": np.array(record["K"]),
-            "extrinsic": pose[:3],
+            "extrinsic": pose,
             "pos": np.zeros((1, 3)),
             "quat": np.zeros((1, 4)),
         }
         scipy.io.savemat(path.with_suffix(".mat"), values)
         path.unlink()
-    if cloud is not None:
-        for path in (root / tree_files.CLOUDS).glob("*/*.ply"):
-            write_points(path, read_points(path) @ torch.from_numpy(cloud).float().T)
+    turn_clouds(root, cloud)
     return root
 
 
-def assert_same_shapes(ours, theirs, splits=tree_files.SPLITS):
-    here = {shape.id: shape for split in tree_files.SPLITS for shape in ShapeTree(ours, split).iter_valid()}
-    there = {shape.id: shape for split in splits for shape in ShapeTree(theirs, split).iter_valid()}
+def assert_same_shapes(ours, theirs):
+    here, there = ({shape.id: shape for shape in all_shapes(root)} for root in (ours, theirs))
     assert here.keys() == there.keys()
     for shape in here.values():
         other = there[shape.id]
@@ -209,16 +204,13 @@ def test_clouds_under_the_name_of_their_own_archive_are_found(ours, tmp_path):
 
 
 def _with_points(shape, points):
-    return type(shape)(shape.images, shape.depth, shape.camera, points, shape.id, shape.category)
+    return dataclasses.replace(shape, points=points)
 
 
 def _boxes(seed):
     rng = np.random.default_rng(seed)
-    boxes = [trimesh.creation.box(rng.uniform(0.05, 0.4, 3)) for _ in range(4)]
-    mesh = trimesh.util.concatenate([box.apply_translation(rng.uniform(-0.3, 0.3, 3)) for box in boxes])
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    surface = Surface.plain(vertices, faces, np.full((len(faces), 3), 0.5))
-    views = Renderer(surface).render(draw_camera(rng, 4, 64))
+    mesh = four_boxes(rng)
+    views = Renderer(plain_surface(mesh)).render(draw_camera(rng, 4, 64))
     points = torch.from_numpy(trimesh.sample.sample_surface(mesh, 2048, seed=seed)[0]).float()
     images = torch.from_numpy(views.images).permute(0, 3, 1, 2) / 255
     camera = views.camera.to(torch.float32)
@@ -232,12 +224,8 @@ SIZE, VIEWS = 137, 4
 
 
 def turn(axis, degrees):
-    """Right-handed rotation about an axis, as Blender's Euler angles are."""
-    (i, j), angle = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis], np.radians(degrees)
-    matrix = np.eye(3)
-    matrix[[i, j], [i, j]] = np.cos(angle)
-    matrix[i, j], matrix[j, i] = -np.sin(angle), np.sin(angle)
-    return matrix
+    """As Blender's Euler angles are."""
+    return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
 
 
 @pytest.mark.parametrize(
@@ -247,9 +235,8 @@ def test_the_camera_is_the_one_their_blender_script_sets_up(azimuth, elevation, 
     """A camera on +x that looks back, child of an empty that is turned by the negative angles, around an OBJ file."""
     parent = turn("z", -azimuth) @ turn("y", -elevation) @ turn("x", -in_plane)
     blender_from_gl = parent @ turn("y", 90) @ turn("z", 90)
-    blender_from_obj = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    rotation = np.diag([1.0, -1, -1]) @ blender_from_gl.T @ blender_from_obj
-    eye = blender_from_obj.T @ parent @ [1.3, 0, 0]
+    rotation = CV_FROM_BLENDER @ blender_from_gl.T @ Y_TO_Z_UP
+    eye = Y_TO_Z_UP.T @ parent @ [1.3, 0, 0]
     pose = cam_from_world(azimuth, elevation, in_plane, 1.3)
     np.testing.assert_allclose(pose[:3, :3], rotation, atol=1e-12)
     np.testing.assert_allclose(pose[:3, 3], -rotation @ eye, atol=1e-12)
@@ -265,15 +252,10 @@ def write_model(folder, mesh, rng):
     (folder / "renderings.txt").write_text("".join(f"{i:02d}.png\n" for i in range(VIEWS)))
     poses = torch.tensor(np.stack([cam_from_world(a, e, r, 1.75 * d) for a, e, r, d, _ in rows])).float()
     K = torch.tensor([[149.84375, 0, 68.5], [0, 149.84375, 68.5], [0, 0, 1]]).expand(VIEWS, 3, 3)
-    faces = np.asarray(mesh.faces)
-    surface = Surface.plain(np.asarray(mesh.vertices), faces, np.full((len(faces), 3), 0.5))
-    views = Renderer(surface).render(PinholeCamera(K, poses, SIZE, SIZE))
+    views = Renderer(plain_surface(mesh)).render(PinholeCamera(K, poses, SIZE, SIZE))
     for i, (image, depth) in enumerate(zip(views.images, views.depth, strict=True)):
         alpha = np.where(np.isfinite(depth), 255, 0).astype(np.uint8)
-        Image.fromarray(np.concatenate((image, alpha[..., None]), axis=2), "RGBA").save(
-            folder / f"{i:02d}.png"
-        )
-    return views
+        Image.fromarray(np.dstack((image, alpha)), "RGBA").save(folder / f"{i:02d}.png")
 
 
 @pytest.fixture(scope="module")
@@ -283,8 +265,7 @@ def choy(tmp_path_factory):
     rng = np.random.default_rng(0)
     for number in range(12):
         shape = f"{(CHAIR, CAR)[number % 2]}/{number:032x}"
-        boxes = [trimesh.creation.box(rng.uniform(0.05, 0.5, 3)) for _ in range(4)]
-        mesh = trimesh.util.concatenate([box.apply_translation(rng.uniform(-0.3, 0.3, 3)) for box in boxes])
+        mesh = four_boxes(rng)
         mesh.apply_translation(-mesh.bounds.mean(0)).apply_scale(1 / np.linalg.norm(mesh.extents))
         write_model(root / "ShapeNetRendering" / shape / "rendering", mesh, rng)
         cloud = root / tree_files.CLOUDS / f"{shape}.ply"
@@ -323,9 +304,7 @@ def test_lists_are_followed_where_there_are_some(choy, tmp_path):
 def test_clouds_with_z_up_are_turned(choy, tmp_path):
     root = tmp_path / "data"
     shutil.copytree(choy, root)
-    for path in (root / tree_files.CLOUDS).glob("*/*.ply"):
-        x, y, z = read_points(path).T
-        write_points(path, torch.stack((x, -z, y), 1))
+    turn_clouds(root, Y_TO_Z_UP)
     report = check_tree(root, processes=1)
     assert report.frame.verdict.startswith("clouds are z-up, cameras expect y-up: clouds are turned")
     assert report.problems == []
@@ -337,45 +316,38 @@ def test_without_clouds_it_says_where_they_go_and_what_works_anyway(choy, tmp_pa
         ShapeTree(tmp_path)
 
 
-def halve(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+def text(name, content):
+    return lambda folder: (folder / name).write_text(content)
+
+
+def picture(change):
+    def damage(folder):
+        with Image.open(folder / "02.png") as image:
+            changed = change(image)
+        changed.save(folder / "02.png")
+
+    return damage
 
 
 DAMAGES = {
-    "a missing picture": (lambda f: (f / "02.png").unlink(), r"02\.png is missing"),
-    "a picture cut short": (lambda f: halve(f / "02.png"), r"02\.png cannot be read"),
-    "a picture of another size": (
-        lambda f: Image.open(f / "02.png").resize((64, 64)).save(f / "02.png"),
-        r"pictures of view 2 are \(64, 64\)",
-    ),
-    "no alpha": (lambda f: Image.open(f / "02.png").convert("RGB").save(f / "02.png"), "no alpha channel"),
-    "a line too few": (
-        lambda f: (f / "rendering_metadata.txt").write_text("0 25 0 0.8 25\n"),
-        "4 pictures and 1 lines",
-    ),
-    "a path for a name": (
-        lambda f: (f / "renderings.txt").write_text("00.png\n../../x.png\n02.png\n03.png\n"),
-        "line 2 is no file name",
-    ),
-    "no numbers": (lambda f: (f / "rendering_metadata.txt").write_text("0 25\n"), "line 1 is not azimuth"),
-    "other cameras": (
-        lambda f: (f / "rendering_metadata.txt").write_text("90 -60 0 0.5 25\n" * 4),
-        "silhouettes and cloud do not agree",
-    ),
-    "an empty mask": (
-        lambda f: Image.new("RGBA", (SIZE, SIZE)).save(f / "02.png"),
-        "view 2 shows nothing",
-    ),
+    r"02\.png is missing": lambda folder: (folder / "02.png").unlink(),
+    r"02\.png cannot be read": lambda folder: halve(folder / "02.png"),
+    r"pictures of view 2 are \(64, 64\)": picture(lambda image: image.resize((64, 64))),
+    "no alpha channel": picture(lambda image: image.convert("RGB")),
+    "4 pictures and 1 lines": text("rendering_metadata.txt", "0 25 0 0.8 25\n"),
+    "line 2 is no file name": text("renderings.txt", "00.png\n../../x.png\n02.png\n03.png\n"),
+    "line 1 is not azimuth": text("rendering_metadata.txt", "0 25\n"),
+    "silhouettes and cloud do not agree": text("rendering_metadata.txt", "90 -60 0 0.5 25\n" * 4),
+    "view 2 shows nothing": picture(lambda image: Image.new("RGBA", image.size)),
 }
 
 
-@pytest.mark.parametrize("kind", DAMAGES)
-def test_broken_models_are_named_and_the_others_stand(choy, tmp_path, kind):
+@pytest.mark.parametrize("said", DAMAGES)
+def test_broken_models_are_named_and_the_others_stand(choy, tmp_path, said):
     root = tmp_path / "data"
     shutil.copytree(choy, root)
-    damage, said = DAMAGES[kind]
     victim = f"{CAR}/{5:032x}"
-    damage(root / "ShapeNetRendering" / victim / "rendering")
+    DAMAGES[said](root / "ShapeNetRendering" / victim / "rendering")
     report = check_tree(root, processes=1)
     assert [problem for problem in report.problems if problem.startswith(victim) and re.search(said, problem)]
     assert all(problem.startswith(victim) for problem in report.problems)

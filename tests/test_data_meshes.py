@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from trees import all_shapes
 
-from train.data import ShapeTree, tree_files
-from train.data.mesh_files import load_surface
+from train.data import tree_files
 from train.data.mesh_sources import (
     UPRIGHT,
     MeshFile,
@@ -20,10 +20,9 @@ from train.data.mesh_sources import (
     read_labels,
     shape_ids,
 )
-from train.data.meshes import LEFT_OUT, MeshOptions, MeshReport, convert
-from train.data.rasterise import Rasteriser
+from train.data.meshes import LEFT_OUT, MeshOptions, MeshReport, convert, load_surface, sample_visible
+from train.data.rays import Rasteriser
 from train.data.render import Orbit, Renderer, draw_camera
-from train.data.visible_samples import sample_visible
 from train.errors import UserError
 
 SMALL = {"size": 32, "views": 2, "processes": 1}
@@ -35,10 +34,6 @@ def save_box(path, extents=(1.0, 2.0, 3.0)):
     path.parent.mkdir(parents=True, exist_ok=True)
     trimesh.creation.box(extents).export(path)
     return path
-
-
-def all_shapes(root):
-    return [shape for split in tree_files.SPLITS for shape in ShapeTree(root, split).iter_valid()]
 
 
 BAD = {  # name -> content, and what is said of it
@@ -98,19 +93,22 @@ def test_surface_is_centred_with_diagonal_one_and_turned(tmp_path):
     np.testing.assert_allclose(extents, np.array([1, 3, 2]) / np.sqrt(14), atol=1e-6)
 
 
-def test_a_mesh_alone_that_is_unusable_leaves_nothing(tmp_path):
-    bad_meshes(tmp_path / "in")
-    with pytest.raises(UserError, match=r"no faces\.obj: no faces"):
-        convert([tmp_path / "in" / "no faces.obj"], tmp_path / "out", **SMALL)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("name", ["missing", "letter.docx", "broken.zip", "nothing"])
-def test_wrong_sources_are_refused(tmp_path, name):
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("no faces.obj", r"no faces\.obj: no faces"),
+        ("missing", "missing"),
+        ("letter.docx", "letter"),
+        ("broken.zip", "broken"),
+        ("nothing", "nothing"),
+    ],
+)
+def test_sources_without_a_usable_mesh_are_refused_and_leave_nothing(tmp_path, name, said):
+    (tmp_path / "no faces.obj").write_text(BAD["no faces.obj"][0])
     (tmp_path / "letter.docx").touch()
     (tmp_path / "broken.zip").write_text("no zip")
     (tmp_path / "nothing").mkdir()
-    with pytest.raises(UserError, match=name):
+    with pytest.raises(UserError, match=said):
         convert([tmp_path / name], tmp_path / "out", **SMALL)
     assert not (tmp_path / "out").exists()
 
@@ -253,13 +251,8 @@ def test_labels_that_fit_nothing_or_are_none(tmp_path):
 
 
 def test_what_is_no_model_is_not_even_a_failure(tmp_path):
-    for name in (
-        "real.obj",
-        "__MACOSX/real.obj",
-        "._real.obj",
-        "out/pcdata_2048/unknown/real.ply",
-        ".git/x.obj",
-    ):
+    names = "real.obj __MACOSX/real.obj ._real.obj out/pcdata_2048/unknown/real.ply .git/x.obj"
+    for name in names.split():
         save_box(tmp_path / name)
     assert [mesh.inside for mesh in find_meshes([tmp_path], tmp_path / "none")[0]] == ["real.obj"]
 
@@ -300,9 +293,8 @@ def test_a_second_run_adds_what_is_new_and_keeps_the_rest(tmp_path):
     made = []
     for name in ("a", "b", "b"):
         save_box(tmp_path / name / "model.obj")
-        report = convert(
-            [tmp_path / name], tmp_path / "out", options=MeshOptions(category=f"{name} kind"), **SMALL
-        )
+        options = MeshOptions(category=f"{name} kind")
+        report = convert([tmp_path / name], tmp_path / "out", options=options, **SMALL)
         made.append((report.made, report.kept, report.others))
         stamp = next((tmp_path / "out" / tree_files.RENDERS).glob("a_kind/*/render_0.png")).stat().st_mtime_ns
         made[-1] += (stamp,)
@@ -330,14 +322,8 @@ def test_the_up_axis_and_the_cameras_reach_the_views(tmp_path):
     """A mast along z, seen from the horizon: upright in the pictures, and as large as distance and focal say."""
     save_box(tmp_path / "mast.obj", (0.1, 0.1, 2.0))
     orbit = Orbit(elevation_deg=(0.0, 0.0), distance=4.0, focal=3.0)
-    convert(
-        [tmp_path / "mast.obj"],
-        tmp_path / "out",
-        size=128,
-        views=3,
-        processes=1,
-        options=MeshOptions(up="z", orbit=orbit),
-    )
+    options = MeshOptions(up="z", orbit=orbit)
+    convert(tmp_path / "mast.obj", tmp_path / "out", size=128, views=3, processes=1, options=options)
     (shape,) = all_shapes(tmp_path / "out")
     for mask in np.isfinite(shape.depth.numpy()):
         rows, columns = np.argwhere(mask).T
@@ -350,9 +336,7 @@ def test_a_scale_keeps_sizes_apart_and_refuses_what_the_frame_would_cut(tmp_path
     for name, side in (("small", 100.0), ("large", 200.0), ("huge", 900.0)):  # say, in millimetres
         save_box(tmp_path / "in" / f"{name}.obj", (side, side, side))
     report = convert([tmp_path / "in"], tmp_path / "out", options=MeshOptions(scale=0.002), **SMALL)
-    sides = {
-        shape.id.split("/")[1]: np.ptp(shape.points.numpy(), axis=0) for shape in all_shapes(tmp_path / "out")
-    }
+    sides = {shape.id[8:]: np.ptp(shape.points.numpy(), axis=0) for shape in all_shapes(tmp_path / "out")}
     np.testing.assert_allclose(sides["small"], 0.2, atol=1e-3)
     np.testing.assert_allclose(sides["large"], 0.4, atol=1e-3)
     assert list(report.failures) == ["in: huge.obj"]
@@ -393,16 +377,11 @@ def test_hidden_points_without_embree(tmp_path):
 
 def save_textured(folder, name, images):
     """A box as ShapeNet stores it: OBJ and MTL side by side, the texture in a folder, named relative to them."""
-    folder.mkdir(parents=True)
     (folder / images).mkdir(parents=True)
     Image.new("RGB", (4, 4), (200, 30, 30)).save(folder / images / "texture0.jpg")
     (folder / f"{name}.mtl").write_text(f"newmtl wood\nKd 1 1 1\nmap_Kd {images}/texture0.jpg\n")
-    lines = [
-        f"mtllib {name}.mtl",
-        *(f"v {x} {y} {z}" for x, y, z in BOX.vertices),
-        "vt 0.5 0.5",
-        "usemtl wood",
-    ]
+    lines = [f"mtllib {name}.mtl", "vt 0.5 0.5", "usemtl wood"]
+    lines += [f"v {x} {y} {z}" for x, y, z in BOX.vertices]
     lines += [f"f {a}/1 {b}/1 {c}/1" for a, b, c in BOX.faces + 1]
     (folder / f"{name}.obj").write_text("\n".join(lines))
 
@@ -412,21 +391,14 @@ def test_shapenet_trees_of_both_versions_with_their_textures(tmp_path):
     save_textured(v1 / "03001627" / "1a6f61", "model", "images")
     save_textured(v1 / "02747177" / "ab12", "model", "images")  # trash bin: none of the paper's thirteen
     save_textured(v2 / "02691156" / "10155655850468db" / "models", "model_normalized", "../images")
-    (v2 / "02691156" / "10155655850468db" / "models" / "model_normalized.solid.binvox").write_bytes(
-        b"#binvox"
-    )
+    (v2 / "02691156/10155655850468db/models/model_normalized.solid.binvox").write_bytes(b"#binvox")
     (v2 / "taxonomy.json").write_text("[]")
     report = convert([v1, v2], tmp_path / "out", **SMALL)
     assert not report.failures
     assert report.categories == {"02747177": 1, "chair": 1, "airplane": 1}
-    shapes = [
-        shape for split in tree_files.SPLITS for shape in ShapeTree(tmp_path / "out", split).iter_valid()
-    ]
-    assert {shape.id for shape in shapes} == {
-        "03001627/1a6f61",
-        "02747177/ab12",
-        "02691156/10155655850468db",
-    }
+    shapes = all_shapes(tmp_path / "out")
+    ids = {"03001627/1a6f61", "02747177/ab12", "02691156/10155655850468db"}
+    assert {shape.id for shape in shapes} == ids
     for shape in shapes:
         seen = shape.depth.isfinite()
         red, green, _ = shape.images.movedim(1, 0)
@@ -442,33 +414,30 @@ def test_textures_are_found_by_slashes_of_either_kind_and_only_in_the_library(tm
         folder.mkdir()
         Image.new("RGB", (4, 4), (200, 30, 30)).save(folder / "x.jpg")
     meshes, _ = find_meshes([library], tmp_path)
-    textures = {
-        mesh.path.parent.name: len(load_surface(mesh.path, root=mesh.root).textures) for mesh in meshes
-    }
+    surfaces = {mesh.path.parent.name: load_surface(mesh.path, root=mesh.root) for mesh in meshes}
+    textures = {name: len(surface.textures) for name, surface in surfaces.items()}
     assert textures == {"windows": 1, "thief": 0}
 
 
 def test_a_shapenet_synset_as_a_zip(tmp_path):
-    BOX.export(tmp_path / "model.obj")
     with zipfile.ZipFile(tmp_path / "03001627.zip", "w") as archive:
-        archive.write(tmp_path / "model.obj", "03001627/1a6f61/model.obj")
+        archive.write(save_box(tmp_path / "model.obj"), "03001627/1a6f61/model.obj")
     (tmp_path / "scratch").mkdir()
     meshes, _ = find_meshes([tmp_path / "03001627.zip"], tmp_path / "scratch")
     assert shape_ids(meshes) == ["03001627/1a6f61"]
 
 
-def test_single_files_are_what_their_folders_say(tmp_path):
-    for folder in ("sofas", "20240131", "attic"):
-        (tmp_path / folder).mkdir()
-        BOX.export(tmp_path / folder / "x.off")
-        meshes, _ = find_meshes([tmp_path / folder / "x.off"], tmp_path)
-        assert [mesh.synset for mesh in meshes] == ["04256520" if folder == "sofas" else "unknown"]
+@pytest.mark.parametrize(
+    ("folder", "synset"), [("sofas", "04256520"), ("20240131", "unknown"), ("attic", "unknown")]
+)
+def test_single_files_are_what_their_folders_say(tmp_path, folder, synset):
+    meshes, _ = find_meshes([save_box(tmp_path / folder / "x.off")], tmp_path)
+    assert [mesh.synset for mesh in meshes] == [synset]
 
 
 def test_a_mesh_that_is_named_twice_counts_once_and_libraries_may_share_a_name(tmp_path):
     for place in ("here", "there"):
-        (tmp_path / place / "models" / "sofa").mkdir(parents=True)
-        BOX.export(tmp_path / place / "models" / "sofa" / "x.off")
+        save_box(tmp_path / place / "models" / "sofa" / "x.off")
     here, there = tmp_path / "here" / "models", tmp_path / "there" / "models"
     meshes, _ = find_meshes([here, here / "sofa" / "x.off", here / ".." / "models", there], tmp_path)
     assert [mesh.path.resolve() for mesh in meshes] == [here / "sofa" / "x.off", there / "sofa" / "x.off"]
@@ -487,14 +456,13 @@ def test_a_mesh_that_is_named_twice_counts_once_and_libraries_may_share_a_name(t
     ],
 )
 def test_a_category_for_all(tmp_path, category, synset):
-    (tmp_path / "tables").mkdir()
-    BOX.export(tmp_path / "tables" / "x.off")
+    save_box(tmp_path / "tables" / "x.off")
     meshes, _ = find_meshes([tmp_path], tmp_path)
     assert [mesh.synset for mesh in of_category(meshes, category)] == [synset]
 
 
 def test_each_axis_is_turned_up_and_none_is_mirrored(tmp_path):
-    BOX.export(tmp_path / "x.off")
+    save_box(tmp_path / "x.off")
     for up, rotation in UPRIGHT.items():
         matrix = np.eye(3) if rotation is None else np.reshape(rotation, (3, 3))
         axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
@@ -506,7 +474,7 @@ def test_each_axis_is_turned_up_and_none_is_mirrored(tmp_path):
 
 
 def test_a_furniture_library_says_itself_which_way_is_up(tmp_path):
-    BOX.export(tmp_path / "x.obj")
+    save_box(tmp_path / "x.obj")
     catalogue = "id#1=a\nmodel#1=/a/x.obj\nid#2=b\nmodel#2=/b/x.obj\nmodelRotation#2=1 0 0 0 0 1 0 -1 0\n"
     with zipfile.ZipFile(tmp_path / "lib.sh3f", "w") as archive:
         archive.writestr("PluginFurnitureCatalog.properties", catalogue)

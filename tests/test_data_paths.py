@@ -17,17 +17,15 @@ from train.data import ShapeTree
 from train.data.batches import load_split
 from train.data.cache import damaged_files, prepare
 from train.data.check import check_tree
-from train.data.choy_layout import pictures_of
-from train.data.contact_sheet import show
-from train.data.family_pictures import draw_families
+from train.data.contact_sheet import draw_families, show
 from train.data.images import decode, read_images, read_rgba
-from train.data.mesh_files import load_surface
+from train.data.layouts import layout_of, pictures_of, require_depth
 from train.data.mesh_sources import find_meshes, read_labels
-from train.data.meshes import convert
+from train.data.meshes import convert, load_surface
 from train.data.photos import convert_photos, find_photos
 from train.data.procedural import generate
 from train.data.shrink import Sizes
-from train.data.tree import frame_of, layout_of, read_shape, require_depth
+from train.data.tree import frame_of, read_shape
 from train.files import kept, remove, write_text
 
 SMALL = {"size": 32, "views": 1, "processes": 1}

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial import KDTree
+from trees import all_shapes, files_of
 
 from train.__main__ import main
 from train.data import ShapeTree, tree_files
 from train.data.ambiguity_check import measure_families, measure_tree
 from train.data.categories import SYNSET_OF
+from train.data.contact_sheet import draw_families
 from train.data.families import AMBIGUOUS, FAMILIES, MODES, Cone
-from train.data.family_pictures import draw_families
 from train.data.procedural import ambiguity, generate, variants_of
 from train.data.render import MAX_RADIUS, Renderer, orbit_camera
 from train.data.solids import (
@@ -33,6 +34,7 @@ from train.data.solids import (
 from train.errors import UserError
 
 PAIR = ["chair", "display"]
+SMALL = {"seed": 0, "size": 32, "views": 1, "processes": 1}
 
 
 @pytest.fixture(scope="module")
@@ -42,18 +44,13 @@ def small(tmp_path_factory):
     return out, report
 
 
-def tree_bytes(root):
-    return {path.relative_to(root): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
-
-
 def test_generate_writes_what_it_says(small):
     out, report = small
     assert report.made == 10
     assert "10 shapes" in report.summary()
-    trees = [ShapeTree(out, split) for split in tree_files.SPLITS]
-    shapes = [shape for tree in trees for shape in tree.iter_valid()]
+    shapes = all_shapes(out)
     assert len(shapes) == 10
-    assert not any(tree.skipped for tree in trees)
+    assert not any(ShapeTree(out, split).skipped for split in tree_files.SPLITS)
     assert sorted({shape.category for shape in shapes}) == ["chair", "display"]
     for shape in shapes:
         assert shape.images.shape == (3, 3, 48, 48)
@@ -62,14 +59,12 @@ def test_generate_writes_what_it_says(small):
 
 def test_same_seed_same_bits_with_any_number_of_processes(small, tmp_path):
     generate(tmp_path / "again", shapes=10, categories=PAIR, seed=3, size=48, views=3, processes=2)
-    assert tree_bytes(tmp_path / "again") == tree_bytes(small[0])
+    assert files_of(tmp_path / "again") == files_of(small[0])
 
 
 def test_all_families_are_the_paper_s_and_are_generated_by_default(tmp_path):
     assert sorted(FAMILIES) == sorted(SYNSET_OF)
-    report = generate(
-        tmp_path / "data", shapes=13, categories=None, seed=0, size=32, views=1, processes=1, variants=3
-    )
+    report = generate(tmp_path / "data", shapes=13, categories=None, variants=3, **SMALL)
     assert report.failures == {}
     assert report.made == sum(family.modes for family in FAMILIES.values())
     folders = (tmp_path / "data" / tree_files.RENDERS).glob("*/*")
@@ -83,26 +78,22 @@ def test_other_seed_other_shapes(small, tmp_path):
 
 
 def test_a_restarted_run_keeps_what_is_there_and_adds_the_rest(tmp_path):
-    arguments = {"categories": ["display"], "seed": 0, "size": 32, "views": 2, "processes": 1}
+    arguments = {"categories": ["display"], **SMALL}
     generate(tmp_path / "data", shapes=2, **arguments)
-    before = tree_bytes(tmp_path / "data" / tree_files.RENDERS)
+    before = files_of(tmp_path / "data" / tree_files.RENDERS)
     report = generate(tmp_path / "data", shapes=3, **arguments)
     assert (report.made, report.kept) == (1, 2)
-    after = tree_bytes(tmp_path / "data" / tree_files.RENDERS)
+    after = files_of(tmp_path / "data" / tree_files.RENDERS)
     assert before.items() < after.items()
 
 
 def test_variants_share_views_of_one_object(tmp_path):
-    generate(
-        tmp_path / "data", shapes=1, categories=["chair"], seed=0, size=32, views=2, processes=1, variants=3
-    )
+    generate(tmp_path / "data", shapes=1, categories=["chair"], variants=3, **SMALL)
     folders = sorted((tmp_path / "data" / tree_files.RENDERS).glob("*/*"))
     assert [folder.name[-3:] for folder in folders] == ["_h0", "_h1", "_h2"]
     assert len({(folder / "camera_0.json").read_text() for folder in folders}) == 1
-    assert (
-        len({tree_files.cloud_file(tmp_path / "data", f"03001627/{f.name}").read_bytes() for f in folders})
-        == 3
-    )
+    clouds = {tree_files.cloud_file(tmp_path / "data", f"03001627/{f.name}").read_bytes() for f in folders}
+    assert len(clouds) == 3
 
 
 @pytest.mark.parametrize(
@@ -116,7 +107,7 @@ def test_variants_share_views_of_one_object(tmp_path):
     ],
 )
 def test_wrong_requests_leave_nothing_behind(tmp_path, changes, message):
-    arguments = {"shapes": 1, "categories": None, "seed": 0, "size": 32, "views": 1, "processes": 1}
+    arguments = {"shapes": 1, "categories": None, **SMALL}
     with pytest.raises(UserError, match=message):
         generate(tmp_path / "data", **(arguments | changes))
     assert not (tmp_path / "data").exists()
@@ -185,10 +176,8 @@ def test_rules_are_measured_and_broken_ones_are_named(monkeypatch):
     report = measure_families(["display", "car"], objects=1, seed=4, processes=1)
     assert report.broken == []
     assert "all rules hold" in report.summary()
-    assert {name: list(figures) for name, figures in report.measured.items()} == {
-        "display": ["display 4"],
-        "car": ["car 4"],
-    }
+    measured = {name: list(figures) for name, figures in report.measured.items()}
+    assert measured == {"display": ["display 4"], "car": ["car 4"]}
     same = variants_of("display", 0)[:1] * MODES
     monkeypatch.setattr("train.data.ambiguity_check.variants_of", lambda *_: same)
     report = measure_families(["display"], objects=1, processes=1)
@@ -203,18 +192,9 @@ def test_rules_are_measured_and_broken_ones_are_named(monkeypatch):
 
 def test_the_rules_are_measured_on_the_objects_of_a_dataset(tmp_path):
     for name, categories in (("data", ["lamp", "cabinet"]), ("lamps", ["lamp"])):
-        generate(
-            tmp_path / name,
-            shapes=2,
-            categories=categories,
-            seed=7,
-            size=32,
-            views=1,
-            processes=1,
-            variants=2,
-        )
+        generate(tmp_path / name, shapes=2, categories=categories, variants=2, **(SMALL | {"seed": 7}))
     report = measure_tree(tmp_path / "data", processes=1)
-    assert {name: list(figures) for name, figures in report.measured.items()} == {
+    assert {name: list(objects) for name, objects in report.measured.items()} == {
         "cabinet": ["cabinet_s7_000001"]
     }
     assert report.broken == []
@@ -328,9 +308,8 @@ def test_solids_have_their_volume(solid, expected):
     assert is_closed(solid)
     assert volume(solid) == pytest.approx(expected, rel=0.07)
     assert volume(solid.mirrored()) == pytest.approx(volume(solid))
-    assert volume(solid.turned("x", 30, (1, 1, 1)).moved((1, 0, 0)).scaled(2)) == pytest.approx(
-        8 * volume(solid)
-    )
+    larger = solid.turned("x", 30, (1, 1, 1)).moved((1, 0, 0)).scaled(2)
+    assert volume(larger) == pytest.approx(8 * volume(solid))
 
 
 def test_turning_follows_the_right_hand():
@@ -346,11 +325,8 @@ def test_a_bent_tube_does_not_contain_what_it_bends_around():
     inside = ring.contains(np.array([(0, 0, 0), (0.7, -0.7, 0), (-1, 0, 0), (0, 1, 0.05), (0, 1, 0.2)]))
     assert inside.tolist() == [False, False, True, True, False]
     around = tube([(0, 0, 0), (0, 0, 1), (0, 1, 1)], [0.1] * 3, GREY)
-    assert around.contains(np.array([(0, 0, 0.5), (0, 0.5, 1.0), (0, 0.5, 0.5)])).tolist() == [
-        True,
-        True,
-        False,
-    ]
+    inside = around.contains(np.array([(0, 0, 0.5), (0, 0.5, 1.0), (0, 0.5, 0.5)]))
+    assert inside.tolist() == [True, True, False]
 
 
 def test_ovals_range_from_ellipse_to_rectangle():

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from trees import plain_surface
 
 from diffpoint.camera import PinholeCamera
-from train.data.embree import EmbreeCaster, has_embree
 from train.data.procedural import variants_of
-from train.data.rasterise import Rasteriser
+from train.data.rays import EmbreeCaster, Rasteriser, has_embree
 from train.data.render import MAX_RADIUS, Orbit, Renderer, draw_camera, orbit_camera
-from train.data.solids import surface_of as surface_of_solids
+from train.data.solids import surface_of
 from train.data.surface import Surface
 from train.errors import UserError
 
@@ -24,12 +24,6 @@ needs_embree = pytest.mark.skipif(not has_embree(), reason="embreex has no wheel
 @pytest.fixture(params=[pytest.param(EmbreeCaster, marks=needs_embree), Rasteriser])
 def caster(request):
     return request.param
-
-
-def surface_of(mesh, colour=(0.5, 0.5, 0.5)):
-    return Surface.plain(
-        np.asarray(mesh.vertices), np.asarray(mesh.faces), np.tile(colour, (len(mesh.faces), 1))
-    )
 
 
 def pixel_rays(camera):
@@ -45,7 +39,7 @@ def pixel_rays(camera):
 def test_depth_is_exact_on_a_box(caster):
     camera = orbit_camera(np.array([0.0, 37, 200]), np.array([0.0, 25, -15]), 96)
     half = np.array([0.2, 0.3, 0.1])
-    depth = Renderer(surface_of(trimesh.creation.box(2 * half)), caster).render(camera).depth
+    depth = Renderer(plain_surface(trimesh.creation.box(2 * half)), caster).render(camera).depth
     directions, eyes = pixel_rays(camera)
     crossings = (np.array([-1, 1])[:, None] * half - eyes[:, None, None, None]) / directions[..., None, :]
     near, far = crossings.min(-2).max(-1), crossings.max(-2).min(-1)
@@ -61,7 +55,7 @@ def test_depth_is_depth_and_not_ray_length(caster):
     plane = trimesh.Trimesh(
         [(-9, -9, 0), (9, -9, 0), (9, 9, 0), (-9, 9, 0)], [(0, 1, 2), (0, 2, 3)], process=False
     )
-    depth = Renderer(surface_of(plane), caster).render(orbit_camera(np.zeros(1), np.zeros(1), 32)).depth
+    depth = Renderer(plain_surface(plane), caster).render(orbit_camera(np.zeros(1), np.zeros(1), 32)).depth
     np.testing.assert_allclose(depth, 2.0, atol=1e-5)
 
 
@@ -71,7 +65,7 @@ def test_depth_is_depth_and_not_ray_length(caster):
 )
 def test_up_is_up_and_right_is_right_from_the_front(place, row_sign, column_sign):
     box = trimesh.creation.box((0.1, 0.1, 0.1), transform=trimesh.transformations.translation_matrix(place))
-    depth = Renderer(surface_of(box)).render(orbit_camera(np.zeros(1), np.zeros(1), 64)).depth[0]
+    depth = Renderer(plain_surface(box)).render(orbit_camera(np.zeros(1), np.zeros(1), 64)).depth[0]
     row, column = np.argwhere(np.isfinite(depth)).mean(0) - 31.5
     assert np.sign(round(row)) == row_sign
     assert np.sign(round(column)) == column_sign
@@ -94,7 +88,7 @@ def test_views_are_equispaced_in_azimuth_within_the_elevations():
 
 def test_nothing_within_the_radius_is_cut(caster):
     ball = trimesh.creation.icosphere(3, radius=MAX_RADIUS)
-    depth = Renderer(surface_of(ball), caster).render(draw_camera(np.random.default_rng(0), 4, 112)).depth
+    depth = Renderer(plain_surface(ball), caster).render(draw_camera(np.random.default_rng(0), 4, 112)).depth
     border = np.concatenate((depth[:, 0], depth[:, -1], depth[:, :, 0], depth[:, :, -1]))
     assert not np.isfinite(border).any()
     assert np.isfinite(depth).mean() > 0.6
@@ -102,10 +96,10 @@ def test_nothing_within_the_radius_is_cut(caster):
 
 def test_an_object_behind_the_frame_s_edge_or_camera_is_drawn_without_error(caster):
     ball = trimesh.creation.icosphere(3, radius=3.0)  # the camera is inside
-    depth = Renderer(surface_of(ball), caster).render(orbit_camera(np.zeros(1), np.zeros(1), 16)).depth
+    depth = Renderer(plain_surface(ball), caster).render(orbit_camera(np.zeros(1), np.zeros(1), 16)).depth
     assert np.isfinite(depth).all()
     away = PinholeCamera.look_at((0.0, 0, 9), (0.0, 0, 20), focal_px=30.0, height=16, width=16)
-    views = Renderer(surface_of(ball), caster).render(away.expand(1))
+    views = Renderer(plain_surface(ball), caster).render(away.expand(1))
     assert not np.isfinite(views.depth).any()
     assert (views.images == 255).all()
 
@@ -114,9 +108,9 @@ def test_winding_does_not_matter_and_white_is_not_background(caster):
     box = trimesh.creation.box((0.5, 0.5, 0.5))
     camera = orbit_camera(np.array([30.0]), np.array([20.0]), 64)
     images = [
-        Renderer(surface_of(trimesh.Trimesh(box.vertices, faces, process=False), (1, 1, 1)), caster).render(
-            camera
-        )
+        Renderer(
+            plain_surface(trimesh.Trimesh(box.vertices, faces, process=False), (1, 1, 1)), caster
+        ).render(camera)
         for faces in (box.faces, box.faces[:, ::-1])
     ]
     np.testing.assert_array_equal(images[0].images, images[1].images)
@@ -159,7 +153,7 @@ def textured_ball():
     uv = np.stack((u, ball.vertices[:, 1] * 3), axis=1).astype(np.float32)
     texture = np.random.default_rng(0).integers(0, 256, (6, 5, 3), np.uint8)
     return dataclasses.replace(
-        surface_of(ball),
+        plain_surface(ball),
         face_texture=np.arange(len(ball.faces)) % 2 - 1,
         corner_uv=uv[ball.faces],
         textures=(texture,),
@@ -167,14 +161,14 @@ def textured_ball():
 
 
 AGREEING = {
-    "ring of 12 000 faces": lambda: surface_of(trimesh.creation.torus(0.35, 0.12, 100, 60)),
-    "ball of 81 920 faces": lambda: surface_of(trimesh.creation.icosphere(6, radius=0.5)),
-    "box": lambda: surface_of(trimesh.creation.box((0.5, 0.3, 0.4))),
+    "ring of 12 000 faces": lambda: plain_surface(trimesh.creation.torus(0.35, 0.12, 100, 60)),
+    "ball of 81 920 faces": lambda: plain_surface(trimesh.creation.icosphere(6, radius=0.5)),
+    "box": lambda: plain_surface(trimesh.creation.box((0.5, 0.3, 0.4))),
     "triangles that cross": lambda: soup(300, 0.2),
     "many thin triangles": lambda: soup(5000, 0.02),
     "textured ball": textured_ball,
-    "chair": lambda: surface_of_solids(variants_of("chair", 1)[0]),
-    "watercraft": lambda: surface_of_solids(variants_of("watercraft", 1)[0]),
+    "chair": lambda: surface_of(variants_of("chair", 1)[0]),
+    "watercraft": lambda: surface_of(variants_of("watercraft", 1)[0]),
 }
 
 
@@ -227,7 +221,7 @@ def test_an_orbit_of_one_s_own(caster):
     assert elevation_deg.min() >= 50
     assert elevation_deg.max() <= 60
     np.testing.assert_allclose(camera.K[:, 0, 0], 240)
-    ball = surface_of(trimesh.creation.icosphere(4, radius=0.97 * orbit.max_radius))
+    ball = plain_surface(trimesh.creation.icosphere(4, radius=0.97 * orbit.max_radius))
     depth = Renderer(ball, caster).render(camera).depth
     np.testing.assert_allclose(depth.min((1, 2)), 4 - 0.97 * orbit.max_radius, atol=1e-3)
     border = np.concatenate((depth[:, 0], depth[:, -1], depth[:, :, 0], depth[:, :, -1]))

@@ -8,6 +8,7 @@ import pytest
 import scipy.io
 import torch
 import trimesh
+from trees import all_ids, all_shapes, halve
 
 from diffpoint.io import write_depth
 from train.data import ShapeError, ShapeTree, tree_files
@@ -43,7 +44,7 @@ def root(tmp_path):
 def test_round_trip(tmp_path):
     written, points = write(tmp_path, "03001627/one")
     tree_files.write_lists(tmp_path, seed=0)
-    shape = next(s for split in tree_files.SPLITS for s in ShapeTree(tmp_path, split).iter_valid())
+    (shape,) = all_shapes(tmp_path)
     assert (shape.id, shape.category) == ("03001627/one", "chair")
     np.testing.assert_array_equal((shape.images.numpy() * 255).round(), written.images.transpose(0, 3, 1, 2))
     np.testing.assert_array_equal(np.isfinite(shape.depth.numpy()), np.isfinite(written.depth))
@@ -72,7 +73,7 @@ def test_leftovers_of_a_killed_run_are_cleared_and_never_listed(tmp_path):
     leftover = tmp_path / "data" / tree_files.RENDERS / "03001627" / ".two.0badf00d.tmp"
     leftover.mkdir()
     assert tree_files.write_lists(tmp_path / "data", seed=0)["train"].keys() == {"03001627"}
-    assert sum(len(ShapeTree(tmp_path / "data", split)) for split in tree_files.SPLITS) == 1
+    assert len(all_ids(tmp_path / "data")) == 1
     tree_files.prepare_output(tmp_path / "data", {"size": SIZE})
     assert not leftover.exists()
 
@@ -152,16 +153,12 @@ def test_lines_of_a_list_that_lead_elsewhere_are_refused_by_name(root):
             read_shape(root, name)
 
 
-def truncate(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
 def edit(path, **changes):
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
 BREAKAGES = {
-    "truncated image": ("render_1.png", truncate),
+    "truncated image": ("render_1.png", halve),
     "empty depth": ("depth_0.png", lambda path: path.write_bytes(b"")),
     "depth of 8 bits": ("depth_0.png", lambda path: shutil.copy(path.with_name("render_0.png"), path)),
     "other sizes": ("depth_0.png", lambda path: write_depth(path, torch.ones(8, 8))),
@@ -173,7 +170,7 @@ BREAKAGES = {
     "mirror": ("camera_0.json", lambda path: edit(path, cam_from_world=np.diag([1, -1, 1, 1]).tolist())),
     "lacking key": ("camera_0.json", lambda path: path.write_text("{}")),
     "missing camera": ("camera_0.json", lambda path: path.unlink()),
-    "truncated cloud": ("ply", truncate),
+    "truncated cloud": ("ply", halve),
     "text as cloud": ("ply", lambda path: path.write_text("hello")),
     "missing cloud": ("ply", lambda path: path.unlink()),
 }

@@ -25,10 +25,10 @@ from tests.photographs import as_jpeg, surface_for, take
 from train.config import InferenceConfig
 from train.data.ambiguity_check import AmbiguousObject
 from train.data.batches import Batch, LoadedSplit
-from train.data.embree import has_embree
 from train.data.families.chair import CHAIR
 from train.data.photos import convert_photos
 from train.data.procedural import generate
+from train.data.rays import has_embree
 from train.data.solids import Solid, box, sample_union, surface_of
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate
@@ -40,7 +40,8 @@ from train.experiments.collapse import VARIANTS
 from train.experiments.correlation import correlate, pearson, spearman
 from train.experiments.coverage import APART, hidden_distances, make_object, reach
 from train.experiments.hidden_points import Rays, Scene, embedded_scene, make_scene, quality
-from train.experiments.one_armed.chairs import (
+from train.experiments.one_armed import presence
+from train.experiments.one_armed_chairs import (
     HIDDEN,
     SEED,
     SHOWN,
@@ -51,7 +52,6 @@ from train.experiments.one_armed.chairs import (
     one_armed_chairs,
     without,
 )
-from train.experiments.one_armed.measure import presence
 from train.experiments.page import write_page
 from train.experiments.paper import TABLES, with_critic
 from train.experiments.photos import read_objects
@@ -423,8 +423,8 @@ def test_real_arms_count_as_one_and_missing_ones_as_none(chairs: list[OneArmedCh
 def test_one_armed_chairs_are_measured_and_drawn(
     study: Study, chairs: list[OneArmedChair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module("one_armed.measure"), "CHAIRS", 2)
-    monkeypatch.setattr(module("one_armed.measure"), "one_armed_chairs", lambda: iter(chairs))
+    monkeypatch.setattr(module("one_armed"), "CHAIRS", 2)
+    monkeypatch.setattr(module("one_armed"), "one_armed_chairs", lambda: iter(chairs))
     result, page = made_once("one-armed", study, monkeypatch)
     assert result["chairs"] == 2
     true = {column: found["mean"] for column, found in result["rows"]["the true chair"].items()}
@@ -448,7 +448,7 @@ def test_chairs_have_to_be_trained_on_and_these_ones_must_not_be(
     displays = dataclasses.replace(study, data=(tmp_path / "data",), out=tmp_path / "out")
     with pytest.raises(UserError, match="no chairs to train on"):
         run_experiment("one-armed", displays)
-    monkeypatch.setattr(module("one_armed.measure"), "SEED", 0)
+    monkeypatch.setattr(module("one_armed"), "SEED", 0)
     with pytest.raises(UserError, match="another seed"):
         run_experiment("one-armed", study)
 

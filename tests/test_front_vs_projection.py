@@ -24,17 +24,17 @@ from train.config import FitConfig, StageConfig
 from train.data.batches import Batch
 from train.errors import UserError
 from train.evaluation.metrics import in_silhouette, visible_error
-from train.experiments.front_vs_projection import experiment, networks_page, page
-from train.experiments.front_vs_projection.free_clouds import LOSSES, fit_cloud
+from train.experiments.front_vs_projection import free_clouds, networks
+from train.experiments.front_vs_projection.free_clouds import LOSSES, MANY, ONE, fit_cloud
 from train.experiments.front_vs_projection.networks import TRAININGS, configs, densities, verdict
-from train.experiments.front_vs_projection.shapes import Cameras, embedded_shape, shapes_of
+from train.experiments.front_vs_projection.scenes import Cameras, embedded_shape, shapes_of
 from train.experiments.run import run_experiment
 from train.experiments.study import Study
 from train.methods import get_method, recipe
 from train.methods.losses import view_loss
 
 INFINITY = float("inf")
-ONE, TWO, SPHERE = Cameras(1), Cameras(2), Cameras(6, sphere=True)
+TWO, SPHERE = Cameras(2), Cameras(6, sphere=True)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -79,21 +79,16 @@ def test_a_scene_is_the_same_for_the_same_seed_and_another_for_another():
 def test_one_view_moves_the_points_of_the_projection_loss_along_the_axis_only():
     scene = embedded_shape("chair").scene(ONE, seed=0)
     fits = {
-        name: fit_cloud(scene, LOSSES[name], iterations=60, rate=0.03)
-        for name in LOSSES
-        if name != "front_emd"
+        name: fit_cloud(scene, name, iterations=60, rate=0.03)[0] for name in LOSSES if name != "front_emd"
     }
-    assert fits["projection"].sideways == fits["projection"].largest_sideways == 0
-    assert fits["lin"].largest_sideways == 0
-    assert min(fits["front"].sideways, fits["soft"].sideways) > 0.3
-    measures = {name: fit.measures for name, fit in fits.items()}
-    assert measures["front"].visible_cd < 0.1 * measures["projection"].visible_cd
-    assert (
-        measures["front"].visible_cd < measures["soft"].visible_cd < 0.8 * measures["projection"].visible_cd
-    )
-    assert measures["soft"].inside > 0.8 > 0.3 > measures["projection"].inside
-    assert measures["lin"].left < 0.6, "it deletes what it cannot move"
-    assert fits["projection"].losses[-1] < 0.3 * fits["projection"].losses[0], "it did fit its own loss"
+    front, projection, lin, soft = fits.values()
+    assert projection["sideways"] == projection["largest_sideways"] == lin["largest_sideways"] == 0
+    assert min(front["sideways"], soft["sideways"]) > 0.3
+    assert front["visible_cd"] < 0.1 * projection["visible_cd"]
+    assert front["visible_cd"] < soft["visible_cd"] < 0.8 * projection["visible_cd"]
+    assert soft["inside"] > 0.8 > 0.3 > projection["inside"]
+    assert lin["left"] < 0.6, "it deletes what it cannot move"
+    assert projection["last_loss"] < 0.3 * projection["first_loss"], "it did fit its own loss"
 
 
 def test_meshes_are_seen_from_everywhere_and_trees_from_their_own_views(tiny_data: Path, tmp_path: Path):
@@ -113,12 +108,12 @@ def _numbers(found: dict) -> list[dict]:
 
 
 def test_free_clouds_are_fitted_once_and_repeat_themselves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(experiment, "_SHAPES", 1)
-    monkeypatch.setattr(experiment, "RATES", (0.01, 0.03))
+    for name, value in (("_SHAPES", 1), ("RATES", (0.01, 0.03)), ("SETTINGS", (ONE, MANY))):
+        monkeypatch.setattr(free_clouds, name, value)
     study = Study((), tmp_path, seeds=1, steps=20, progress=False)
-    found, drawn = experiment.free_clouds(study, settings=(ONE,))
-    assert [fit["loss"] for fit in found["fits"]] == list(LOSSES)
-    text = page.markdown(json.loads(json.dumps(found)))
+    found, drawn = free_clouds.free_clouds(study)
+    assert [fit["loss"] for fit in found["fits"] if fit["cameras"] == ONE.name] == list(LOSSES)
+    text = free_clouds.markdown(json.loads(json.dumps(found)))
     assert "0 exactly" in text
     error = found["table"][ONE.name]["front"]["visible_cd"]
     assert f"| {error['mean']:.2f} ± {error['sd']:.2f} |" in text
@@ -130,10 +125,8 @@ def test_free_clouds_are_fitted_once_and_repeat_themselves(tmp_path: Path, monke
     lost = next(path for path in cells if path.name.startswith("embedded_chair"))
     before = {path: path.stat().st_mtime_ns for path in cells}
     lost.unlink()
-    monkeypatch.setattr(
-        experiment.page, "draw", lambda *_, **__: {}
-    )  # takes seconds, and fits nothing that is kept
-    again, _ = experiment.free_clouds(study, settings=(ONE,))
+    monkeypatch.setattr(free_clouds, "draw", lambda *_: {})  # takes seconds, and fits nothing that is kept
+    again, _ = free_clouds.free_clouds(study)
     assert _numbers(again) == _numbers(found)
     assert {path for path in cells if path.stat().st_mtime_ns != before[path]} == {lost}
 
@@ -163,7 +156,7 @@ def test_the_published_page_shows_what_was_measured():
     docs = Path(__file__).parents[1] / "docs"
     found = json.loads((docs / "results" / "front-vs-projection.json").read_text())
     text = (docs / "front-vs-projection.md").read_text()
-    made = page.markdown(found) + networks_page.markdown(found["networks"])
+    made = free_clouds.markdown(found) + networks.markdown(found["networks"])
     rows = [line for line in made.splitlines() if line.startswith("| ") and re.search(r" ± | to ", line)]
     assert len(rows) > 50
     assert [row for row in rows if row not in text] == []
@@ -174,35 +167,35 @@ def test_networks_are_trained_measured_and_resumed(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without the free clouds, which are tested above."""
-    monkeypatch.setattr(experiment, "free_clouds", lambda study: ({"fits": [], "table": {}}, {}))
-    monkeypatch.setattr(experiment.page, "markdown", lambda found: "free clouds\n")
+    monkeypatch.setattr(free_clouds, "free_clouds", lambda study: ({"fits": [], "table": {}}, {}))
+    monkeypatch.setattr(free_clouds, "markdown", lambda found: "free clouds\n")
     for alike in ("projection", "soft"):
         monkeypatch.delitem(TRAININGS, alike)
     study = Study((tiny_data,), tmp_path, "smoke", seeds=1, limit=3, steps=2, progress=False)
-    monkeypatch.setattr("train.experiments.front_vs_projection.networks._VIEWS", 2)
-    networks = run_experiment("front-vs-projection", study)["networks"]
-    assert list(networks["single"]) == list(TRAININGS)
-    assert "horizon" not in networks["many"]
+    monkeypatch.setattr(networks, "_VIEWS", 2)
+    found = run_experiment("front-vs-projection", study)["networks"]
+    assert list(found["single"]) == list(TRAININGS)
+    assert "horizon" not in found["many"]
     assert len(list((tmp_path / "runs").iterdir())) == len(configs(study)) == 5
-    front, horizon = (networks["single"][name]["stage1"] for name in ("front", "horizon"))
+    front, horizon = (found["single"][name]["stage1"] for name in ("front", "horizon"))
     assert front["visible"]["by_seed"] != horizon["visible"]["by_seed"]
-    curve = networks["single"]["front"]["curves"][0]
+    curve = found["single"]["front"]["curves"][0]
     assert curve["step"] == [0, 1, 2]
     assert curve["left"] == curve["visible"][-1] / curve["visible"][0]
-    assert networks["floor"]["inside"] > 0.8
-    assert networks["floor"]["front_density"] == pytest.approx(1, abs=0.2)
+    assert found["floor"]["inside"] > 0.8
+    assert found["floor"]["front_density"] == pytest.approx(1, abs=0.2)
     text = (tmp_path / "front-vs-projection.md").read_text()
     assert text.startswith("free clouds\n")
     assert f"{front['visible']['mean']:.2f}" in text
     for picture in ("networks", "predictions"):
         assert (tmp_path / f"front-vs-projection-{picture}.png").stat().st_size > 10_000
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*")}
-    assert run_experiment("front-vs-projection", study)["networks"] == networks
+    assert run_experiment("front-vs-projection", study)["networks"] == found
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*")} == before
 
 
 def test_trainings_differ_in_their_loss_alone() -> None:
-    made = [training.config(recipe("ours", "cpu"), single=True) for training in TRAININGS.values()]
+    made = [training.single(recipe("ours", "cpu")) for training in TRAININGS.values()]
     plain = {
         dataclasses.replace(
             config,
@@ -268,9 +261,7 @@ def test_projection_losses_have_the_unit_of_the_front_constraint(
     expected = 0.1 * 144 * (56 / 28) ** 2 if front == "emd" else 100 * 0.1
     assert value == pytest.approx(expected, rel=1e-4)
     like = view_loss(*plate, _stage("front", front=front), step=0).loss.item()
-    assert (1 if front == "emd" else 2) * expected == pytest.approx(
-        like, rel=0.15
-    )  # chamfer: both directions
+    assert (1 if front == "emd" else 2) * expected == pytest.approx(like, rel=0.15)  # chamfer: both ways
 
 
 def test_every_supervision_has_a_gradient_and_soft_ones_sharpen(plate: tuple[Tensor, Batch]) -> None:

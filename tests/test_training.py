@@ -24,7 +24,7 @@ from models import build_generator
 from tests.one_step_each import one_step_each
 from train.__main__ import main
 from train.config import FitConfig
-from train.data import store
+from train.data import tree_files
 from train.data.batches import LoadedSplit, load_split
 from train.data.render import Renderer, draw_camera
 from train.data.solids import bar, sample_union, surface_of
@@ -358,9 +358,11 @@ def pole_data(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     shutil.copytree(tiny_data, root)
     pole, rng = [bar((0, -0.45, 0), (0, 0.45, 0), 0.01, np.array([0.2, 0.3, 0.8]))], np.random.default_rng(0)
     views = Renderer(surface_of(pole)).render(draw_camera(rng, 4, 64))
-    for split in store.SPLITS:
-        store.write_shape(root, f"03001627/pole_{split}", views, sample_union(pole, store.POINTS, rng))
-        with (root / store.LISTS / split / "03001627.list").open("a") as file:
+    for split in tree_files.SPLITS:
+        tree_files.write_shape(
+            root, f"03001627/pole_{split}", views, sample_union(pole, tree_files.POINTS, rng)
+        )
+        with (root / tree_files.LISTS / split / "03001627.list").open("a") as file:
             file.write(f"03001627/pole_{split}\n")
     return root
 
@@ -399,8 +401,8 @@ def test_a_batch_of_nothing_but_empty_depth_maps_trains(system: str, pole_data: 
     config = _without_critic(config, steps=(1, 1 if config.stage2.steps else 0))
     poles = tmp_path / "poles"
     shutil.copytree(pole_data, poles)
-    for split in store.SPLITS:
-        for file in (poles / store.LISTS / split).glob("*.list"):
+    for split in tree_files.SPLITS:
+        for file in (poles / tree_files.LISTS / split).glob("*.list"):
             file.write_text(f"03001627/pole_{split}\n" if file.stem == "03001627" else "")
     assert fit(poles, tmp_path / "run", config, progress=False)
     assert all(np.isfinite(record["loss"]) for record in read_metrics(tmp_path / "run"))

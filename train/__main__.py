@@ -23,7 +23,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from train.config import FitConfig, Profile, fit_config_from_json, renamed_options, with_steps
 from train.data_commands import Data
 from train.errors import UserError
-from train.experiments.registry import ABOUT_ALL, EXPERIMENTS
+from train.experiments.registry import ABOUT_ALL, EXPERIMENTS, FORMER_NAMES
 from train.methods import METHODS, recipe
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
@@ -170,6 +170,10 @@ def _about_experiments() -> str:
     """
 
 
+def _experiment_name(words: list[str]) -> str:
+    return FORMER_NAMES.get(words[0], words[0])
+
+
 @dataclasses.dataclass
 class Experiment:
     name: Annotated[
@@ -177,8 +181,8 @@ class Experiment:
         PrimitiveConstructorSpec(
             nargs=1,
             metavar="NAME",
-            choices=(*EXPERIMENTS, *ABOUT_ALL),
-            instance_from_str=lambda words: words[0],
+            choices=(*EXPERIMENTS, *ABOUT_ALL, *FORMER_NAMES),
+            instance_from_str=_experiment_name,
             is_instance=lambda value: isinstance(value, str),
             str_from_instance=lambda value: [value],
         ),

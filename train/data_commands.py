@@ -186,10 +186,11 @@ class Rules:
 
     def run(self) -> int:
         from train.data.ambiguity_check import measure_families, measure_tree
-        from train.data.families import FAMILIES
-        from train.data.family_pictures import draw_families
 
         if self.pictures is not None:
+            from train.data.contact_sheet import draw_families
+            from train.data.families import FAMILIES
+
             draw_families(self.pictures, self.categories or tuple(FAMILIES), seed=self.seed)
         if self.data is not None:
             report = measure_tree(self.data)

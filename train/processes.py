@@ -5,20 +5,20 @@ Nothing here imports torch: the command line imports this module, and a worker t
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import pickle
 import signal
+import subprocess
 import sys
 import threading
 import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
-from types import FrameType
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -53,9 +53,12 @@ def run_in_processes(
         UserError: a worker was killed from outside, for instance for lack of memory.
         Exception: whatever the first call that failed has raised.
     """
-    bar = progress_bar(total=len(calls), title=title, unit=title.removesuffix("s"), progress=progress)
-    with bar:
-        for _ in _results(function, calls, processes, on_crash="stop", title=title):
+    killed = UserError(
+        f"one of the {title} was killed from outside (out of memory?); run the same command again to continue, with "
+        "fewer --processes"
+    )
+    with progress_bar(total=len(calls), title=title, unit=title.removesuffix("s"), progress=progress) as bar:
+        for _ in _results(function, calls, processes, crash=killed):
             bar.update()
 
 
@@ -84,11 +87,13 @@ def map_unordered(
         KeyboardInterrupt: Ctrl-C, or SIGTERM while there are workers.
         UserError: a result is an `OSError` which says that nothing more can be written.
     """
+    if os.name == "nt":
+        processes = 1  # workers get their pipe in a way that Windows does not have
     if processes is None:
         processes = min(os.cpu_count() or 1, len(jobs) // jobs_per_process)
     if processes > 1:
-        calls = [(job,) for job in jobs]
-        results = _results(function, calls, processes, on_crash="return", title=title)
+        crash = OSError("the process that worked on it crashed or ran out of memory")
+        results = _results(function, [(job,) for job in jobs], processes, crash=crash)
     else:
         results = ((number, function(job)) for number, job in enumerate(jobs))
     with progress_bar(total=len(jobs), title=title, unit=unit, progress=progress) as bar:
@@ -103,17 +108,16 @@ def map_unordered(
 
 
 def _results(
-    function: Callable[..., Any],
-    calls: Sequence[tuple[Any, ...]],
-    processes: int,
-    *,
-    on_crash: Literal["stop", "return"],
-    title: str,
+    function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], processes: int, *, crash: Exception
 ) -> Iterator[tuple[int, Any]]:
-    """Yields (number of the call, result) as calls finish. A worker has one call at a time; none waits in a queue."""
+    """Yields (number of the call, result) as calls finish. A worker has one call at a time; none waits in a queue.
+
+    `crash` is the result of a call whose worker crashed, if it is an `OSError`; else it is raised as an exception of
+    the call would be, after the running calls have finished.
+    """
     waiting = deque(enumerate(calls))
     idle: list[_Worker] = []
-    busy: dict[Connection, tuple[_Worker, int]] = {}
+    busy: dict[Any, tuple[_Worker, int]] = {}
     failed: BaseException | None = None
     finished = False
     with StopRequest() as stop:
@@ -125,22 +129,13 @@ def _results(
                     busy[worker.connection] = worker, number
                     worker.send(function, call)
                 for connection in wait(list(busy), timeout=0.5):
-                    worker, number = busy.pop(connection)  # type: ignore[arg-type]
+                    worker, number = busy.pop(connection)
                     try:
                         succeeded, result = worker.receive()
+                        idle.append(worker)
                     except (EOFError, OSError):
                         worker.end()
-                        succeeded = on_crash == "return"
-                        result = (
-                            OSError("the process that worked on it crashed or ran out of memory")
-                            if succeeded
-                            else UserError(
-                                f"one of the {title} was killed from outside (out of memory?); run the same command "
-                                "again to continue, with fewer --processes"
-                            )
-                        )
-                    else:
-                        idle.append(worker)
+                        succeeded, result = isinstance(crash, OSError), crash
                     if succeeded:
                         yield number, result
                     else:
@@ -152,7 +147,7 @@ def _results(
             workers = [*idle, *(worker for worker, _ in busy.values())]
             if not finished:
                 for worker in workers:
-                    worker.terminate()
+                    worker.process.terminate()
             for worker in workers:
                 worker.end()
     if failed is not None:
@@ -160,18 +155,29 @@ def _results(
 
 
 class _Worker:
-    """A process that makes one call after the other, as they come through a pipe; it ends when the pipe is closed."""
+    """A Python process that makes one call after the other, as they come through a pipe, until the pipe is closed.
+
+    It is a new interpreter, not a fork, which would hang where the parent has threads; and no process of
+    `multiprocessing`, which would run the program's main script again. It leads a session of its own: a Ctrl-C in the
+    terminal reaches the parent only, and a worker gets one SIGTERM from there.
+    """
 
     def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")  # a fork of a process with threads can hang
-        self.connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,))
-        with _without_interrupts(), _without_main():
-            self._process.start()
-        theirs.close()
+        self.connection, theirs = Pipe()
+        with theirs:
+            code = (
+                f"import sys; sys.path[:] = {sys.path!r}; from train.processes import _serve; "
+                f"_serve({theirs.fileno()}, {os.getpid()})"
+            )
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", code],
+                stdin=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
 
     def send(self, function: Callable[..., Any], call: tuple[Any, ...]) -> None:
-        """Starts a call. Plain pickle, because multiprocessing's own would share tensors instead of copying them."""
+        """Starts a call. Plain pickle, because `Connection.send` would share tensors instead of copying them."""
         message = pickle.dumps((function, call))
         with suppress(BrokenPipeError):  # it crashed; `receive` finds out
             self.connection.send_bytes(message)
@@ -183,24 +189,20 @@ class _Worker:
             result.__cause__ = RuntimeError(f"in a worker process:\n{trace}")
         return succeeded, result
 
-    def terminate(self) -> None:
-        """Sends SIGTERM."""
-        self._process.terminate()
-
     def end(self) -> None:
         """Waits until the process has ended, after its current call."""
         self.connection.close()
-        self._process.join()
-        self._process.close()
+        self.process.wait()
 
 
-def _serve(connection: Connection) -> None:
-    """What a worker does."""
-    if hasattr(os, "setsid"):  # not on Windows
-        os.setsid()  # a terminal's Ctrl-C, or a SIGTERM to the whole group, would come beside the parent's SIGTERM
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def _serve(descriptor: int, parent: int) -> None:
+    """The worker's main function."""
+    threading.Thread(target=_end_with_parent, args=(parent,), daemon=True).start()
     first = True
-    with suppress(EOFError, ConnectionError):  # the parent has no more calls, or has ended
+    with (
+        Connection(descriptor) as connection,
+        suppress(EOFError, ConnectionError),
+    ):  # the parent has closed it
         while True:
             message = connection.recv_bytes()
             try:
@@ -213,8 +215,15 @@ def _serve(connection: Connection) -> None:
             connection.send_bytes(answer)
 
 
+def _end_with_parent(parent: int) -> None:
+    """Without this, the workers of a killed process would go on."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
 def _pickled_error(error: BaseException) -> bytes:
-    trace = "".join(traceback.format_exception(type(error), error, error.__traceback__))
+    trace = "".join(traceback.format_exception(error))
     try:
         message = pickle.dumps((False, error, trace))
         pickle.loads(message)
@@ -226,54 +235,9 @@ def _pickled_error(error: BaseException) -> bytes:
 def _use_one_thread() -> None:
     """Networks and shapes this small use a core each better than all cores together."""
     if "torch" in sys.modules:
-        import torch
-
-        torch.set_num_threads(1)
+        sys.modules["torch"].set_num_threads(1)
     if "diffpoint" in sys.modules:
-        import diffpoint
-
-        diffpoint.configure(threads=1)
-
-
-def _end_with_parent() -> None:
-    """Without this, the workers of a killed process would go on."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os.kill(os.getpid(), signal.SIGTERM)
-
-
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Processes started in this block never see Ctrl-C, from their first moment on: a child inherits the blocking."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    from multiprocessing import resource_tracker
-
-    resource_tracker.ensure_running()  # else the first process starts it, which unblocks the signal
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-@contextmanager
-def _without_main() -> Iterator[None]:
-    """Processes started in this block do not import the program's main script.
-
-    A script without `if __name__ == "__main__"` would start again in each of them.
-    """
-    main = sys.modules["__main__"]
-    hidden = {name: getattr(main, name) for name in ("__spec__", "__file__") if hasattr(main, name)}
-    for name in hidden:
-        setattr(main, name, None)
-    try:
-        yield
-    finally:
-        for name, value in hidden.items():
-            setattr(main, name, value)
+        sys.modules["diffpoint"].configure(threads=1)
 
 
 class StopRequest:
@@ -292,14 +256,11 @@ class StopRequest:
                 self._previous[number] = signal.signal(number, self._note)
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._restore()
-
-    def _note(self, _number: int, _frame: FrameType | None) -> None:
+    def _note(self, *_: object) -> None:
         self.requested = True
-        self._restore()
+        self.__exit__()
 
-    def _restore(self) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous.clear()

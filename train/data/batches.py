@@ -153,9 +153,13 @@ def load_split(
     Raises:
         UserError: no such tree, no usable shape, or renders whose side is not a multiple of `map_size`.
     """
-    trees = [ShapeTree(root, split, list(categories) or None) for root in _roots(data)]
-    if limit is not None:
-        _thin_out(trees, limit)
+    roots = [Path(root) for root in ([data] if isinstance(data, str | Path) else data)]
+    trees = [ShapeTree(root, split, list(categories) or None) for root in roots]
+    total = sum(map(len, trees))
+    if limit is not None and total > limit:
+        kept, start = {number * total // limit for number in range(limit)}, 0
+        for tree in trees:
+            start, tree.ids = start + len(tree), [name for i, name in enumerate(tree.ids, start) if i in kept]
     sizes = Sizes(image_size, map_size, gt_pool)
     shapes: list[Shape] = []
     for tree in trees:
@@ -167,11 +171,16 @@ def load_split(
             else:
                 tree.skipped[name] = str(small)
     skipped = {shape: reason for tree in trees for shape, reason in tree.skipped.items()}
-    shapes = _of_the_usual_size(shapes, skipped)
+    sizes_of = [(len(shape.images), len(shape.points)) for shape in shapes]
+    usual = Counter(sizes_of).most_common(1)[0][0] if shapes else None
+    for shape, size in zip(shapes, sizes_of, strict=True):
+        if size != usual:
+            skipped[shape.id] = f"{shape.id}: (views, points) are {size}, elsewhere {usual}"
+    shapes = [shape for shape, size in zip(shapes, sizes_of, strict=True) if size == usual]
     for reason in skipped.values():
         tqdm.write(f"left out: {reason}", file=sys.stderr)
     if not shapes:
-        where = ", ".join(map(str, _roots(data)))
+        where = ", ".join(map(str, roots))
         raise UserError(f"{where}: no usable shape in the {split} split; try `python -m train data check`")
     return LoadedSplit(
         images=[shape.images for shape in shapes],
@@ -182,34 +191,6 @@ def load_split(
         ids=[shape.id for shape in shapes],
         categories=[shape.category for shape in shapes],
     )
-
-
-def _roots(data: str | Path | Sequence[str | Path]) -> list[Path]:
-    return [Path(root) for root in ([data] if isinstance(data, str | Path) else data)]
-
-
-def _thin_out(trees: Sequence[ShapeTree], limit: int) -> None:
-    """Leaves at most `limit` shapes, spread evenly over all trees."""
-    total = sum(map(len, trees))
-    if total <= limit:
-        return
-    kept = {number * total // limit for number in range(limit)}
-    start = 0
-    for tree in trees:
-        ids, tree.ids = tree.ids, [shape for i, shape in enumerate(tree.ids, start) if i in kept]
-        start += len(ids)
-
-
-def _of_the_usual_size(shapes: list[Shape], skipped: dict[str, str]) -> list[Shape]:
-    """Keeps the shapes with the most common numbers of views and points; names the others in `skipped`."""
-    if not shapes:
-        return shapes
-    sizes = [(len(shape.images), len(shape.points)) for shape in shapes]
-    usual = Counter(sizes).most_common(1)[0][0]
-    for shape, size in zip(shapes, sizes, strict=True):
-        if size != usual:
-            skipped[shape.id] = f"{shape.id}: (views, points) are {size}, elsewhere {usual}"
-    return [shape for shape, size in zip(shapes, sizes, strict=True) if size == usual]
 
 
 class Sampler:

@@ -32,11 +32,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from diffpoint.camera import PinholeCamera
-from train.data.axis_frames import Frame
 from train.data.categories import category_of
+from train.data.layouts import layout_of
 from train.data.shape import Shape, ShapeError
 from train.data.shrink import Sizes, shrink
-from train.data.tree import frame_of, layout_of, read_shape
+from train.data.tree import frame_of, read_shape
 from train.errors import UserError
 from train.files import replacing
 from train.processes import map_unordered, progress_bar
@@ -70,19 +70,42 @@ def prepare(
         UserError: `sizes` do not fit the renders.
     """
     root = Path(root)
-    tree = _Tree(root, sizes, _frame_name(frame_of(root)))
-    places = [folder / _settings(sizes) for folder in _folders(root)]
-    found = _look_up(places, tree, shapes, name=name, progress=progress)
+    frame = frame_of(root)
+    turns = (frame.turn_cloud, frame.turn_world, frame.turn_camera)
+    tree = _Tree(root, sizes, " ".join(repr(np.asarray(turn, float).tolist()) for turn in turns))
+    (height, width), side, pool = sizes.image_size, sizes.map_size, sizes.pool
+    places = [folder / f"{height}x{width}-maps{side}-{pool}-v{_VERSION}" for folder in _folders(root)]
+    found: dict[str, Shape | ShapeError] = {}
+    unusable: Counter[str] = Counter()
+    for shape in progress_bar(shapes, title=f"opening {name}", unit="shape", progress=progress, leave=False):
+        result = _open(places, tree, shape)
+        if isinstance(result, Shape):
+            found[shape] = result
+        elif result:
+            unusable[result] += 1
+    for reason, count in sorted(unusable.items()):
+        what = "shape is" if count == 1 else "shapes are"
+        _print(f"{root}: {count} prepared {what} {reason}; made again")
     missing = [shape for shape in shapes if shape not in found]
-    if missing:
-        place = _first_writable(places, root)
-        if place is not None:
-            with _one_at_a_time(place):
-                # Another process may have made them while this one waited.
-                found |= {shape: small for shape in missing if (small := _find(places, tree, shape)[0])}
-                missing = [shape for shape in missing if shape not in found]
-                found |= _make(place, tree, missing, name=name, progress=progress)
-        found |= _read(tree, [shape for shape in missing if shape not in found], name=name, progress=progress)
+    place = _first_writable(places, root) if missing else None
+    if place is not None:
+        with _one_at_a_time(place):
+            # Another process may have made them while this one waited.
+            found |= {
+                shape: small for shape in missing if isinstance(small := _open(places, tree, shape), Shape)
+            }
+            missing = [shape for shape in missing if shape not in found]
+            found |= _make(place, tree, missing, name=name, progress=progress)
+    missing = [shape for shape in missing if shape not in found]  # those whose files could not be kept
+    for shape in progress_bar(
+        missing, title=f"reading {name}", unit="shape", progress=progress and bool(missing)
+    ):
+        try:
+            found[shape] = tree.read(shape)
+        except ShapeError as error:
+            found[shape] = error
+        except UserError as error:
+            raise UserError(f"{root}: {error}") from None
     return {shape: found[shape] for shape in shapes}
 
 
@@ -91,13 +114,11 @@ def damaged_files(root: str | Path) -> list[Path]:
     damaged = []
     for folder in _folders(Path(root)):
         for path in sorted(folder.glob(f"*-v{_VERSION}/*/*.safetensors")):
-            try:
+            with contextlib.suppress(SafetensorError, OSError):
                 about, tensors = _load(path)
-            except (SafetensorError, OSError):
-                damaged.append(path)
-            else:
-                if about.get("checksum") != _checksum(tensors):
-                    damaged.append(path)
+                if about.get("checksum") == _checksum(tensors):
+                    continue
+            damaged.append(path)
     return damaged
 
 
@@ -125,11 +146,6 @@ class _Tree(NamedTuple):
         return shrink(read_shape(self.root, shape), self.sizes)
 
 
-def _frame_name(frame: Frame) -> str:
-    turns = (frame.turn_cloud, frame.turn_world, frame.turn_camera)
-    return " ".join(repr(np.asarray(turn, float).tolist()) for turn in turns)
-
-
 def _line(name: str, stat: os.stat_result) -> str:
     return f"{name} {stat.st_size} {stat.st_mtime_ns}"
 
@@ -142,11 +158,6 @@ def _folders(root: Path) -> list[Path]:
         return [Path(chosen) / tree]
     caches = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
     return [root / ".prepared", caches / "diffpoint" / "prepared" / tree]
-
-
-def _settings(sizes: Sizes) -> str:
-    height, width = sizes.image_size
-    return f"{height}x{width}-maps{sizes.map_size}-{sizes.pool}-v{_VERSION}"
 
 
 def _first_writable(places: Sequence[Path], root: Path) -> Path | None:
@@ -168,7 +179,7 @@ def _first_writable(places: Sequence[Path], root: Path) -> Path | None:
 
 @contextlib.contextmanager
 def _one_at_a_time(place: Path) -> Iterator[None]:
-    """Waits for other processes that make files in `place`. Without file locks, the same work may be done twice."""
+    """Waits for other processes that make files in `place`; where files cannot be locked, work may be done twice."""
     try:
         import fcntl
     except ImportError:  # not on Windows
@@ -185,53 +196,27 @@ def _one_at_a_time(place: Path) -> Iterator[None]:
         yield
 
 
-def _look_up(
-    places: Sequence[Path], tree: _Tree, shapes: Sequence[str], *, name: str, progress: bool
-) -> dict[str, Shape | ShapeError]:
-    """The shapes whose files are there and fit; prints how many files do not fit."""
-    found: dict[str, Shape | ShapeError] = {}
-    unusable: Counter[str] = Counter()
-    for shape in progress_bar(shapes, title=f"opening {name}", unit="shape", progress=progress, leave=False):
-        small, reason = _find(places, tree, shape)
-        if small is not None:
-            found[shape] = small
-        elif reason:
-            unusable[reason] += 1
-    for reason, count in sorted(unusable.items()):
-        what = "shape is" if count == 1 else "shapes are"
-        _print(f"{tree.root}: {count} prepared {what} {reason}; made again")
-    return found
-
-
-def _find(places: Sequence[Path], tree: _Tree, shape: str) -> tuple[Shape | None, str]:
-    """A prepared shape from the first place that has a file that fits; else what is wrong with the file, if any."""
+def _open(places: Sequence[Path], tree: _Tree, shape: str) -> Shape | str:
+    """A shape from the first place that has a file that fits; else what is wrong with a file, "" if there is none."""
     source, reason = tree.source(shape), ""
     for place in places:
-        result = _open(place, shape, source)
-        if isinstance(result, Shape):
-            return result, ""
-        reason = reason or result
-    return None, reason
-
-
-def _open(place: Path, shape: str, source: str) -> Shape | str:
-    """A prepared shape, or what is wrong with its file: "" if there is none."""
-    path = _file(place, shape)
-    try:
-        about, tensors = _load(path)
-        changed = about.get("time") != str(path.stat().st_mtime_ns)
-    except (FileNotFoundError, NotADirectoryError):
-        return ""
-    except (SafetensorError, OSError):
-        return "damaged"
-    if about.get("source") != source:
-        return "outdated"
-    if changed:
-        return "damaged"
-    size = tensors["depth"].shape[-1]
-    camera = PinholeCamera(tensors["K"], tensors["cam_from_world"], size, size)
-    category = category_of(shape.split("/")[0])
-    return Shape(tensors["images"], tensors["depth"], camera, tensors["points"], shape, category)
+        path = _file(place, shape)
+        try:
+            about, tensors = _load(path)
+            changed = about.get("time") != str(path.stat().st_mtime_ns)
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except (SafetensorError, OSError):
+            reason = reason or "damaged"
+            continue
+        if about.get("source") != source or changed:
+            reason = reason or ("outdated" if about.get("source") != source else "damaged")
+            continue
+        size = tensors["depth"].shape[-1]
+        camera = PinholeCamera(tensors["K"], tensors["cam_from_world"], size, size)
+        category = category_of(shape.split("/")[0])
+        return Shape(tensors["images"], tensors["depth"], camera, tensors["points"], shape, category)
+    return reason
 
 
 def _load(path: Path) -> tuple[Mapping[str, str], dict[str, Tensor]]:
@@ -286,27 +271,19 @@ def _make(
                 raise UserError(f"{tree.root}: {result}")
             elif isinstance(result, OSError):  # its process crashed
                 made[job.shape] = ShapeError(f"{job.shape}: {result}")
-            elif isinstance(result, _NoRoom):
-                _print(f"prepared shapes cannot be kept in {place} ({result.reason}); see {_PLACE}")
+            elif result:
+                _print(f"prepared shapes cannot be kept in {place} ({result}); see {_PLACE}")
                 break
     for shape in shapes:
-        if shape not in made and isinstance(opened := _open(place, shape, tree.source(shape)), Shape):
+        if shape not in made and isinstance(opened := _open([place], tree, shape), Shape):
             made[shape] = opened
     return made
 
 
-class _NoRoom(NamedTuple):
-    """Why a file could not be written."""
-
-    reason: str
-
-
-def _make_one(job: _Job) -> UserError | _NoRoom | None:
-    """Makes one file, perhaps in a worker process."""
+def _make_one(job: _Job) -> UserError | str:
+    """Makes one file, perhaps in a worker process; returns why it could not be written, "" if it is there."""
     try:
-        source = job.tree.source(
-            job.shape
-        )  # before reading, so that a change while it is read is noticed later
+        source = job.tree.source(job.shape)  # first, so that a change while it is read is noticed later
         small = job.tree.read(job.shape)
         K, cam_from_world = small.camera.K, small.camera.cam_from_world
         values = (small.images, small.depth, K, cam_from_world, small.points)
@@ -323,22 +300,8 @@ def _make_one(job: _Job) -> UserError | _NoRoom | None:
     except UserError as error:
         return error
     except OSError as error:
-        return _NoRoom(error.strerror or str(error))
-    return None
-
-
-def _read(tree: _Tree, shapes: Sequence[str], *, name: str, progress: bool) -> dict[str, Shape | ShapeError]:
-    """Shapes whose files could not be kept, read into memory."""
-    read: dict[str, Shape | ShapeError] = {}
-    bar = progress_bar(shapes, title=f"reading {name}", unit="shape", progress=progress and len(shapes) > 0)
-    for shape in bar:
-        try:
-            read[shape] = tree.read(shape)
-        except ShapeError as error:
-            read[shape] = error
-        except UserError as error:
-            raise UserError(f"{tree.root}: {error}") from None
-    return read
+        return error.strerror or str(error)
+    return ""
 
 
 def _print(text: str) -> None:

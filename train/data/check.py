@@ -6,17 +6,16 @@ import dataclasses
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
 from train.data import tree_files
-from train.data.axis_frames import AS_IT_IS, Frame, find_frame
 from train.data.cache import damaged_files
 from train.data.categories import category_of
-from train.data.consistency import Consistency, measure_consistency
-from train.data.tree import Shape, ShapeError, ShapeTree, frame_of, layout_of, read_shape, sample_shapes
+from train.data.consistency import AS_IT_IS, Consistency, Frame, find_frame, measure_consistency
+from train.data.layouts import layout_of
+from train.data.tree import Shape, ShapeError, ShapeTree, frame_of, read_shape, sample_shapes
 from train.processes import map_unordered
 
 _INK = 0.85
@@ -32,8 +31,7 @@ class TreeReport:
 
     Attributes:
         path: root of the tree.
-        counts: readable shapes by split.
-        categories: and by category.
+        counts, categories: readable shapes by split and by category.
         consistencies: of the readable shapes.
         problems: a line for each.
         frame: the axis conventions of clouds and cameras.
@@ -60,13 +58,10 @@ class TreeReport:
 
     def summary(self) -> str:
         """Lines for the terminal."""
-        splits = ", ".join(f"{count} {split}" for split, count in self.counts.items())
-        kinds = ", ".join(f"{count} {name}" for name, count in self.categories.items())
+        splits, kinds = tree_files.in_words(self.counts), tree_files.in_words(self.categories)
         consistent = sum(each.holds for each in self.consistencies)
-        files, fit = (
-            "cameras, silhouettes and clouds",
-            f"{self.inside:.2%} of the points project into the silhouette",
-        )
+        files = "cameras, silhouettes and clouds"
+        fit = f"{self.inside:.2%} of the points project into the silhouette"
         if self.has_depth:
             files = "cameras, depth and clouds"
             fit += f", visible ones are {self.residual:.4f} from the depth map"
@@ -85,18 +80,13 @@ class TreeReport:
         return "\n".join(lines)
 
 
-class _Job(NamedTuple):
-    root: Path
-    shape: str
-
-
 @dataclasses.dataclass(frozen=True)
 class _Checked:
     """A readable shape: what is wrong with it, and what must be the same for all shapes of a tree."""
 
     consistency: Consistency
     views: int
-    size: tuple[int, int]
+    size: str
     points: int
     has_depth: bool
     problems: tuple[str, ...]
@@ -125,23 +115,21 @@ def check_tree(path: str | Path, *, processes: int | None = None) -> TreeReport:
         if shape not in listed
     ]
     frame = frame_of(root)
-    jobs = [
-        _Job(root, shape) for shape in dict.fromkeys(shape for tree in trees.values() for shape in tree.ids)
-    ]
+    shapes = dict.fromkeys(shape for tree in trees.values() for shape in tree.ids)
     checked: dict[str, _Checked] = {}
-    for job, result in map_unordered(
+    for (_, shape), result in map_unordered(
         _check_one,
-        jobs,
+        [(root, shape) for shape in shapes],
         processes=processes,
         title="checking",
         unit="shape",
         jobs_per_process=_SHAPES_PER_PROCESS,
     ):
         if isinstance(result, _Checked):
-            checked[job.shape] = result
+            checked[shape] = result
         else:
-            problems.append(str(result) if isinstance(result, ShapeError) else f"{job.shape}: {result}")
-    checked = {job.shape: checked[job.shape] for job in jobs if job.shape in checked}
+            problems.append(str(result) if isinstance(result, ShapeError) else f"{shape}: {result}")
+    checked = {shape: checked[shape] for shape in shapes if shape in checked}
     inconsistent = [shape for shape, each in checked.items() if not each.consistency.holds]
     if tree_files.is_own(root) and 2 * len(inconsistent) > len(checked):
         frame = _changed_frame(root, inconsistent)
@@ -165,9 +153,9 @@ def check_tree(path: str | Path, *, processes: int | None = None) -> TreeReport:
     )
 
 
-def _check_one(job: _Job) -> _Checked | ShapeError:
+def _check_one(job: tuple[Path, str]) -> _Checked | ShapeError:
     try:
-        shape = read_shape(job.root, job.shape)
+        shape = read_shape(*job)
     except ShapeError as error:
         return error
     found = measure_consistency(shape)
@@ -175,7 +163,7 @@ def _check_one(job: _Job) -> _Checked | ShapeError:
     if not found.holds:
         what = "depth and cloud" if shape.has_depth else "silhouettes and cloud"
         problems.append(f"{shape.id}: cameras, {what} do not agree ({found})")
-    size = (shape.depth.shape[1], shape.depth.shape[2])
+    size = f"{shape.depth.shape[2]} x {shape.depth.shape[1]}"
     return _Checked(found, len(shape.depth), size, len(shape.points), shape.has_depth, tuple(problems))
 
 
@@ -202,15 +190,9 @@ def _unusual(checked: dict[str, _Checked]) -> list[str]:
         values = {shape: getattr(each, name) for shape, each in checked.items()}
         usual = Counter(values.values()).most_common(1)[0][0] if values else None
         problems += [
-            f"{shape}: {_text(value)} {unit}, elsewhere {_text(usual)}"
-            for shape, value in values.items()
-            if value != usual
+            f"{shape}: {value} {unit}, elsewhere {usual}" for shape, value in values.items() if value != usual
         ]
     return problems
-
-
-def _text(value) -> str:
-    return " x ".join(map(str, value[::-1])) if isinstance(value, tuple) else str(value)
 
 
 def _changed_frame(root: Path, shapes: list[str]) -> Frame:
@@ -218,9 +200,5 @@ def _changed_frame(root: Path, shapes: list[str]) -> Frame:
     found = find_frame(sample_shapes(layout_of(root), shapes))
     if not found.settled or not found.changes:
         return dataclasses.replace(AS_IT_IS, verdict=found.verdict, settled=found.settled)
-    conventions = found.verdict.split(":")[0]
-    return dataclasses.replace(
-        AS_IT_IS,
-        verdict=f"{conventions}; not as this program wrote them: make the data again",
-        settled=False,
-    )
+    verdict = f"{found.verdict.split(':')[0]}; not as this program wrote them: make the data again"
+    return dataclasses.replace(AS_IT_IS, verdict=verdict, settled=False)

@@ -1,7 +1,8 @@
-"""Contact sheets of a data tree: for each category one picture with a strip of views for each shape."""
+"""Pictures of data: contact sheets of a tree's categories, and the procedural families with their hidden variants."""
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,10 @@ from torch import Tensor
 from diffpoint import PinholeCamera, project
 from train.data import tree_files
 from train.data.categories import category_of, synset_of
+from train.data.families import FAMILIES
+from train.data.procedural import variants_of
+from train.data.render import Renderer, orbit_camera
+from train.data.solids import Solid, surface_of
 from train.data.tree import Shape, ShapeError, ShapeTree, read_shape
 from train.errors import UserError
 from train.files import replacing
@@ -30,6 +35,11 @@ _TALLEST = 16  # strips in a column before there are two columns
 _FINER = 3  # clouds are drawn this many times larger, then reduced
 _RADIUS = 1.2  # pixels
 _INK = (90, 100, 112)
+_FAMILY_CELL = 130
+_FAMILY_RULE = 3  # pixels between one variant's views and the next's
+# (azimuth, elevation) in degrees of the views of a variant, and of a shape of a family without variants.
+_VARIANT_VIEWS = ((55, 20), (140, 20), (205, 25))
+_SHAPE_VIEWS = ((0, 12), (40, 25), (90, 5), (150, 25), (215, -12))
 
 
 def show(
@@ -116,9 +126,7 @@ def _title(text: str) -> np.ndarray:
 
 def _arranged(strips: Sequence[np.ndarray]) -> np.ndarray:
     """Strips below each other, in as many columns as keep the sheet about as wide as high."""
-    columns = 1
-    while -(-len(strips) // columns) > _TALLEST * columns:
-        columns += 1
+    columns = math.ceil(math.sqrt(len(strips) / _TALLEST))
     height = -(-len(strips) // columns)
     blank = np.full_like(strips[0], 255)
     padded = [*strips, *[blank] * (columns * height - len(strips))]
@@ -157,3 +165,43 @@ def _cloud_picture(points: Tensor, camera: PinholeCamera) -> np.ndarray:
         (x, y), colour = pixels[point], tuple(tones[point].tolist())
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour)
     return _resized(np.asarray(picture))
+
+
+def draw_families(
+    out: str | Path, categories: Sequence[str], *, objects: int = 4, seed: int = 0
+) -> list[Path]:
+    """Writes one picture for each family, `<category>.png`, with a row for each object.
+
+    A family with designed ambiguity shows the front once, and then each variant from the side, from behind at an angle
+    and from behind. The others show two objects in a row, from five sides each.
+    """
+    paths = []
+    for category in categories:
+        rows = [_row(category, seed + number) for number in range(objects)]
+        path = Path(out) / f"{category}.png"
+        picture = Image.fromarray(np.concatenate(rows)).quantize(192, dither=Image.Dither.NONE)
+        with replacing(path) as temporary:
+            picture.save(temporary, format="PNG", optimize=True)
+        paths.append(path)
+    return paths
+
+
+def _row(category: str, seed: int) -> np.ndarray:
+    cone = FAMILIES[category].cone
+    if cone is None:
+        shapes = [variants_of(category, 2 * seed + k)[0] for k in range(2)]
+        pictures = [_seen_from(solids, _SHAPE_VIEWS) for solids in shapes]
+    else:
+        variants = variants_of(category, seed)
+        front = _seen_from(variants[0], ((cone.azimuth_deg, cone.elevation_deg),))
+        pictures = [front, *(_seen_from(solids, _VARIANT_VIEWS) for solids in variants)]
+    rule = np.full((_FAMILY_CELL, _FAMILY_RULE, 3), 205, np.uint8)
+    return np.concatenate([part for picture in pictures for part in (rule, picture)][1:], axis=1)
+
+
+def _seen_from(solids: list[Solid], angles: Sequence[tuple[float, float]]) -> np.ndarray:
+    azimuth_deg, elevation_deg = np.array(angles, float).T
+    images = (
+        Renderer(surface_of(solids)).render(orbit_camera(azimuth_deg, elevation_deg, _FAMILY_CELL)).images
+    )
+    return np.concatenate(list(images), axis=1)

@@ -58,13 +58,19 @@ def read_images(paths: Sequence[str | Path], *, size: int = 224) -> Tensor:
     Raises:
         UserError: a file is missing, is no image, or shows nothing.
     """
-    squares = [_square(_read(path)) for path in paths]
-    return torch.cat(
-        [
+    resized = []
+    for path in paths:
+        picture = on_white(_decode_object(path))
+        if picture.min() > _BLANK:
+            raise UserError(f"{path} shows nothing: it is white or transparent everywhere")
+        height, width = picture.shape[1:]
+        side = max(height, width)
+        left, top = (side - width) // 2, (side - height) // 2
+        square = F.pad(picture, (left, side - width - left, top, side - height - top), value=1.0)
+        resized.append(
             F.interpolate(square[None], size=(size, size), mode="bilinear", antialias=True).clamp(0, 1)
-            for square in squares
-        ]
-    )
+        )
+    return torch.cat(resized)
 
 
 def read_rgba(path: str | Path) -> np.ndarray:
@@ -90,14 +96,6 @@ def is_cut_out(rgba: np.ndarray) -> bool:
     return sum(float(np.quantile(side[:, :3].min(1), 0.1)) >= _WHITE for side in sides) >= 3
 
 
-def _read(path: str | Path) -> Tensor:
-    """(3, H, W) in [0, 1] on white."""
-    picture = on_white(_decode_object(path))
-    if picture.min() > _BLANK:
-        raise UserError(f"{path} shows nothing: it is white or transparent everywhere")
-    return picture
-
-
 def _decode_object(path: str | Path) -> np.ndarray:
     """`decode`, with errors for the user."""
     if not Path(path).is_file():
@@ -121,10 +119,3 @@ def _scaled(pixels: np.ndarray) -> np.ndarray:
     """As float32 in [0, 1]."""
     top = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1.0
     return np.asarray(pixels, np.float32) / np.float32(top)
-
-
-def _square(image: Tensor) -> Tensor:
-    height, width = image.shape[1:]
-    side = max(height, width)
-    left, top = (side - width) // 2, (side - height) // 2
-    return F.pad(image, (left, side - width - left, top, side - height - top), value=1.0)

@@ -1,29 +1,36 @@
-"""Finding meshes in folders, archives and single files; their categories and names."""
+"""Finding meshes in folders, zip archives, Sweet Home 3D libraries and single files; their categories and names."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
 import hashlib
-import math
 import re
+import shutil
 import unicodedata
+import zipfile
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from scipy.spatial import transform
 
-from train.data.archives import ARCHIVE_SUFFIXES, Rotation, catalogue_rotations, is_library, unpack
 from train.data.categories import SYNSET_OF, UNKNOWN, synset_of
 from train.data.tree_files import CLOUDS
 from train.errors import UserError
+from train.files import DISK_ERRORS
 
+Rotation = tuple[float, ...]
+"""9 numbers, row by row."""
+
+ARCHIVE_SUFFIXES = (".zip", ".sh3f")
 MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".off", ".stl")
 _GENERAL_NAMES = {"model", "models", "model_normalized", "mesh", "meshes", "object"}
 _NOT_A_MODEL = re.compile(rf"(^|/)(\.|__MACOSX/|{CLOUDS}/)")
 """Hidden files, the resource forks in macOS archives, and the clouds of a dataset made below the source."""
 
+_CATALOGUE = "PluginFurnitureCatalog.properties"
 _SYNSET = re.compile(r"[01]\d{7}")  # WordNet's offsets; a folder that is a date starts with 2
 
 UPRIGHT: dict[str, Rotation | None] = {
@@ -100,32 +107,77 @@ def find_meshes(
     for source in {path.resolve(): path for path in map(Path, sources)}.values():
         if not source.exists():
             raise UserError(f"no such file or folder: {source}")
+        whole, archives = source.resolve(), []
         if source.is_dir():
-            meshes += _in_folder(source, source.resolve().name, UPRIGHT[up])
+            meshes += _in_folder(source, whole.name, UPRIGHT[up])
             archives = sorted(path for path in source.rglob("*") if path.suffix.lower() in ARCHIVE_SUFFIXES)
         elif source.suffix.lower() in ARCHIVE_SUFFIXES:
             archives = [source]
         elif source.suffix.lower() in MESH_SUFFIXES:
-            meshes.append(
-                MeshFile(
-                    source,
-                    source.resolve().parent.name,
-                    source.name,
-                    _synset_from(source.resolve().parts[-4:-1]),
-                    UPRIGHT[up],
-                )
-            )
-            archives = []
+            synset = _synset_from(whole.parts[-4:-1])
+            meshes.append(MeshFile(source, whole.parent.name, source.name, synset, UPRIGHT[up]))
         else:
             known = ", ".join(ARCHIVE_SUFFIXES + MESH_SUFFIXES)
             raise UserError(f"{source} is neither a folder nor one of {known}")
         for archive in archives:
             folder = scratch / str(len(list(scratch.iterdir())))
-            refused |= unpack(archive, folder)
-            upright = None if is_library(folder) else UPRIGHT[up]
-            meshes += _in_folder(folder, archive.name, upright, catalogue_rotations(folder))
+            refused |= _unpack(archive, folder)
+            if (folder / _CATALOGUE).is_file():  # models of a furniture library stand upright and face +z
+                meshes += _in_folder(folder, archive.name, None, _catalogue_rotations(folder))
+            else:
+                meshes += _in_folder(folder, archive.name, UPRIGHT[up])
     once = {mesh.path.resolve(): mesh for mesh in reversed(meshes)}  # a source may lie in another
     return list(reversed(once.values())), refused
+
+
+def _unpack(archive: Path, folder: Path) -> dict[str, str]:
+    """Unpacks an archive into a new folder; returns why members were refused, by their names.
+
+    Raises:
+        UserError: no zip archive, or not enough space.
+    """
+    refused = {}
+    folder.mkdir(parents=True)
+    try:
+        with zipfile.ZipFile(archive) as content:
+            members = [member for member in content.infolist() if not member.filename.endswith("/")]
+            if sum(member.file_size for member in members) > shutil.disk_usage(folder).free:
+                raise UserError(
+                    f"{archive} unpacks to more than the free space of {folder.parent}; set TMPDIR to a larger place"
+                )
+            for member in members:
+                parts = PurePosixPath(member.filename.replace("\\", "/")).parts
+                name = f"{archive.name}: {member.filename}"
+                if not parts:
+                    refused[name] = "its path names no file"
+                    continue
+                if ".." in parts or member.filename.startswith(("/", "\\")) or ":" in parts[0]:
+                    refused[name] = "its path leads out of the archive"
+                    continue
+                try:
+                    content.extract(member, folder)
+                except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, EOFError) as error:
+                    if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+                        raise UserError(
+                            f"{archive} cannot be unpacked in {folder.parent} ({error.strerror}); "
+                            "set TMPDIR to a larger place"
+                        ) from error
+                    refused[name] = f"cannot be unpacked ({error})"
+    except zipfile.BadZipFile as error:
+        raise UserError(f"{archive} is not a zip archive ({error}); download it again") from error
+    return refused
+
+
+def _catalogue_rotations(folder: Path) -> dict[str, Rotation]:
+    """The rotations that a furniture library gives to some of its models, by path inside the library."""
+    content = (folder / _CATALOGUE).read_text("latin-1")
+    entries = dict(re.findall(r"^(\w+#\d+)=(.*?)\s*$", content, re.MULTILINE))
+    rotations = {}
+    for key, model in entries.items():
+        numbers = entries.get(key.replace("model#", "modelRotation#"), "").split()
+        if key.startswith("model#") and len(numbers) == 9:
+            rotations[model.lstrip("/")] = tuple(map(float, numbers))
+    return rotations
 
 
 def _in_folder(
@@ -189,20 +241,8 @@ def _turn_of(text: str, where: str) -> Rotation | None:
     parts = re.fullmatch(r"([xyz])(-?\d+)", text.strip())
     if parts is None:
         raise UserError(f"{where}: the turn {text!r} is not an axis and degrees, such as y90")
-    angle = math.radians(int(parts[2]))
-    first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[parts[1]]
-    matrix = np.eye(3)
-    matrix[first, first] = matrix[second, second] = round(math.cos(angle), 12)
-    matrix[second, first] = round(math.sin(angle), 12)
-    matrix[first, second] = -matrix[second, first]
-    return tuple(matrix.ravel().tolist())
-
-
-def _followed_by(rotation: Rotation | None, turn: Rotation | None) -> Rotation | None:
-    """The rotation that is `rotation` followed by `turn`."""
-    if rotation is None or turn is None:
-        return rotation or turn
-    return tuple((np.reshape(turn, (3, 3)) @ np.reshape(rotation, (3, 3))).ravel().tolist())
+    matrix = transform.Rotation.from_euler(parts[1], int(parts[2]), degrees=True).as_matrix()
+    return tuple(matrix.round(12).ravel().tolist())
 
 
 def keep_labelled(
@@ -222,16 +262,22 @@ def keep_labelled(
     for label in labels:
         found = by_place.get((label.library, label.model), [])
         for mesh in found:
-            turned = _followed_by(mesh.rotation, label.turn)
-            kept.append(dataclasses.replace(mesh, synset=label.synset, rotation=turned))
+            rotation = mesh.rotation or label.turn
+            if mesh.rotation and label.turn:
+                both = np.reshape(label.turn, (3, 3)) @ np.reshape(mesh.rotation, (3, 3))
+                rotation = tuple(both.ravel().tolist())
+            kept.append(dataclasses.replace(mesh, synset=label.synset, rotation=rotation))
         if not found and label.library in libraries | {""}:
             absent[f"{label.library or Path(path).name}: {label.model}"] = (
                 "the label file names it, but its library does not contain it"
             )
     if not kept:
+        named, given = (
+            ", ".join(sorted(name or "any library" for name in names)[:5]) or "nothing"
+            for names in ({label.library for label in labels}, libraries)
+        )
         raise UserError(
-            f"no line of {path} fits the meshes: its libraries are {_some({label.library for label in labels})}, "
-            f"the sources are {_some(libraries)}"
+            f"no line of {path} fits the meshes: its libraries are {named}, the sources are {given}"
         )
     return kept, absent
 
@@ -241,10 +287,6 @@ def of_category(meshes: Sequence[MeshFile], category: str) -> list[MeshFile]:
     synset = _synset_from([category])
     synset = synset_of(category) if synset == UNKNOWN else synset
     return [dataclasses.replace(mesh, synset=synset) for mesh in meshes]
-
-
-def _some(names: set[str]) -> str:
-    return ", ".join(sorted(name or "any library" for name in names)[:5]) or "nothing"
 
 
 def shape_ids(meshes: Sequence[MeshFile]) -> list[str]:

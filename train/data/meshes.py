@@ -11,10 +11,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.resolvers import FilePathResolver
+from trimesh.visual import ColorVisuals, TextureVisuals
 
+from diffpoint.camera import PinholeCamera
 from train.data import tree_files
 from train.data.categories import category_of
-from train.data.mesh_files import MeshError, load_surface
 from train.data.mesh_sources import (
     UPRIGHT,
     MeshFile,
@@ -24,9 +28,8 @@ from train.data.mesh_sources import (
     read_labels,
     shape_ids,
 )
-from train.data.render import Orbit, Renderer, draw_camera
-from train.data.surface import sample_triangles
-from train.data.visible_samples import sample_visible
+from train.data.render import Orbit, Renderer, draw_camera, orbit_camera
+from train.data.surface import Surface, sample_triangles
 from train.errors import UserError
 from train.files import write_text
 from train.processes import map_unordered
@@ -35,6 +38,20 @@ LEFT_OUT = "left_out.csv"
 """In the dataset's folder: the meshes that the last run could not use, and why."""
 
 _NAMED = 20  # as many are named on the terminal
+_TEXTURE_SIZE = 512
+"""Larger textures are made smaller: a view has few pixels, and the nearest texel of a large texture is noise."""
+
+_LARGEST_FILE = 256 << 20
+"""Bytes: about ten million faces, which take 5 GB of memory to read. A mesh of three million takes 1.7 GB."""
+
+_FLAT = 1e-5  # extent over the diagonal
+
+_CAMERAS, _SIZE = 64, 320
+_DRAWN_AT_ONCE = 4  # candidates for each requested point
+_ROUNDS = 8
+_SAME, _NEAR = 1e-4, 0.02
+"""Shares of the depth. A face hides a point if its plane is nearer by more than the first on the ray to the point; the
+plane counts only if the depth at the pixel's centre differs from the point's by less than the second."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,11 +91,8 @@ class MeshReport:
 
     Attributes:
         out: the dataset.
-        made: shapes of this run.
-        kept: shapes that an earlier run had made of these sources.
-        others: shapes of the dataset that are not from these sources.
-        counts: shapes of the dataset by split.
-        categories: and by category.
+        made, kept, others: its shapes that this run and an earlier one have made of these sources, and all others.
+        counts, categories: its shapes by split and by category.
         failures: reasons by the name of the mesh.
     """
 
@@ -92,8 +106,7 @@ class MeshReport:
 
     def summary(self) -> str:
         """Lines for the terminal."""
-        splits = ", ".join(f"{count} {split}" for split, count in self.counts.items())
-        kinds = ", ".join(f"{count} {name}" for name, count in self.categories.items())
+        splits, kinds = tree_files.in_words(self.counts), tree_files.in_words(self.categories)
         earlier = f", {self.kept} were there" if self.kept else ""
         earlier += f", {self.others} are not from these sources" if self.others else ""
         lines = [f"{self.out}: made {self.made} shapes{earlier} ({splits}): {kinds}"]
@@ -148,15 +161,13 @@ def convert(
     options, out = options or MeshOptions(), Path(out)
     labels = None if labels is None else Path(labels)
     sources = [sources] if isinstance(sources, str | Path) else sources
-    for name, value, low, high in (("size", size, 16, 2048), ("views", views, 1, 256)):
-        if not low <= value <= high:
-            raise UserError(f"{name} must be between {low} and {high}; got {value}")
+    tree_files.require_between(size=(size, 16, 2048), views=(views, 1, 256))
     if labels is not None and options.category is not None:
         raise UserError("labels and category both set the category of the meshes; give one of them")
     options.check()
-    wanted = read_labels(labels) if labels is not None else None
+    wanted = None if labels is None else read_labels(labels)
     with tempfile.TemporaryDirectory(prefix="meshes-") as scratch:
-        meshes, failures = find_meshes([Path(source) for source in sources], Path(scratch), up=options.up)
+        meshes, failures = find_meshes(sources, scratch, up=options.up)
         if not meshes:
             raise UserError(f"no meshes in {', '.join(map(str, sources)) or 'no sources'}")
         if wanted is not None and labels is not None:
@@ -164,11 +175,21 @@ def convert(
             failures |= absent
         if options.category is not None:
             meshes = of_category(meshes, options.category)
-        tree_files.prepare_output(out, _settings(size, views, seed, options))
-        jobs = [
-            _Job(mesh, shape, out, size, views, seed, options)
-            for mesh, shape in zip(meshes, shape_ids(meshes), strict=True)
-        ]
+        settings = {
+            "kind": "meshes",
+            "seed": seed,
+            "size": size,
+            "views": views,
+            "elevation": list(options.orbit.elevation_deg),
+            "distance": options.orbit.distance,
+            "focal": options.orbit.focal,
+            "up": options.up,
+            "scale": options.scale,
+            "drop hidden": options.drop_hidden,
+        }
+        tree_files.prepare_output(out, settings)
+        named = zip(meshes, shape_ids(meshes), strict=True)
+        jobs = [_Job(mesh, shape, out, size, views, seed, options) for mesh, shape in named]
         made = kept = 0
         for job, result in map_unordered(
             _convert_one, jobs, processes=processes, title="rendering meshes", unit="mesh"
@@ -182,41 +203,19 @@ def convert(
     totals = {split: sum(by_synset.values()) for split, by_synset in counts.items()}
     if not sum(totals.values()):
         tree_files.discard(out)
-        name, reason = next(iter(failures.items()))
-        others = f" (and {len(failures) - 1} others)" if len(failures) > 1 else ""
-        raise UserError(f"no usable mesh; {name}: {reason}{others}")
-    _write_left_out(out, failures)
+        raise UserError(f"no usable mesh; {tree_files.first_of(failures)}")
+    if failures:
+        table = io.StringIO()
+        csv.writer(table).writerows([("mesh", "reason"), *sorted(failures.items())])
+        write_text(out / LEFT_OUT, table.getvalue())
+    else:
+        (out / LEFT_OUT).unlink(missing_ok=True)
     categories = {
         category_of(synset): sum(by_synset[synset] for by_synset in counts.values())
         for synset in counts["train"]
     }
     others = sum(totals.values()) - made - kept
     return MeshReport(out, made, kept, others, totals, categories, failures)
-
-
-def _settings(size: int, views: int, seed: int, options: MeshOptions) -> dict:
-    """The settings that must be the same throughout a dataset."""
-    return {
-        "kind": "meshes",
-        "seed": seed,
-        "size": size,
-        "views": views,
-        "elevation": list(options.orbit.elevation_deg),
-        "distance": options.orbit.distance,
-        "focal": options.orbit.focal,
-        "up": options.up,
-        "scale": options.scale,
-        "drop hidden": options.drop_hidden,
-    }
-
-
-def _write_left_out(out: Path, failures: dict[str, str]) -> None:
-    if not failures:
-        (out / LEFT_OUT).unlink(missing_ok=True)
-        return
-    table = io.StringIO()
-    csv.writer(table).writerows([("mesh", "reason"), *sorted(failures.items())])
-    write_text(out / LEFT_OUT, table.getvalue())
 
 
 def _convert_one(job: _Job) -> int | Exception:
@@ -252,3 +251,221 @@ def _convert_one(job: _Job) -> int | Exception:
     except Exception as error:  # whatever is wrong with one mesh, the others must be made
         return MeshError(f"{type(error).__name__}: {error}")
     return 1
+
+
+# Reading a mesh file: any format of trimesh, with its textures, materials and colours.
+
+
+class MeshError(Exception):
+    """Why a mesh cannot become a shape."""
+
+
+def load_surface(
+    path: str | Path,
+    rotation: Sequence[float] | None = None,
+    *,
+    scale: float | None = None,
+    root: str | Path | None = None,
+) -> Surface:
+    """Loads a mesh, turns it, and centres its bounding box on the origin.
+
+    Args:
+        path: the file.
+        rotation: 9 numbers, row by row; None for none.
+        scale: world units per unit of the file; None makes the diagonal of the bounding box 1, as ShapeNet does.
+        root: folder below which its materials and textures may be; by default that above the file's, for ShapeNet's
+            second version names textures `../images/...`.
+
+    Raises:
+        MeshError: no faces, coordinates that are no numbers, no extent in one of the three directions (as one triangle
+            has none), a file that cannot be read or is too large.
+    """
+    path = Path(path)
+    if path.stat().st_size > _LARGEST_FILE:
+        raise MeshError(f"larger than {_LARGEST_FILE >> 20} MB: reduce its number of faces")
+    try:
+        files = _Files(path, Path(root) if root else path.parent.parent)
+        with path.open("rb") as file:
+            scene = trimesh.load(
+                file, file_type=path.suffix[1:].lower(), resolver=files, force="scene", process=False
+            )
+        parts = _parts(scene)  # pyright: ignore[reportArgumentType]
+    except MeshError:
+        raise
+    except Exception as error:  # each format's reader has its own exceptions
+        raise MeshError(f"cannot be read ({type(error).__name__}: {error})") from error
+    if not parts:
+        raise MeshError("no faces")
+    surface = _joined(parts)
+    corners = surface.vertices[surface.faces]
+    if not np.isfinite(corners).all():
+        raise MeshError("NaN or infinite vertices")
+    if rotation is not None:
+        corners = corners @ np.reshape(rotation, (3, 3)).T
+    low, high = corners.min((0, 1)), corners.max((0, 1))
+    diagonal = float(np.linalg.norm(high - low))
+    if diagonal == 0 or not np.isfinite(diagonal):
+        raise MeshError("no extent: all its vertices are at one point")
+    corners = (corners - (low + high) / 2) / diagonal
+    sides = corners[:, 1:] - corners[:, :1]
+    if np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() < 1e-9:
+        raise MeshError("no area: all its faces are lines or points")
+    corners = corners.reshape(-1, 3)
+    _, axes = np.linalg.eigh(corners.T @ corners - len(corners) * np.outer(corners.mean(0), corners.mean(0)))
+    if np.ptp(corners @ axes[:, 0]) < _FLAT:
+        raise MeshError("flat: all its faces lie in one plane, a view along it would show nothing")
+    if scale is not None:
+        corners *= diagonal * scale
+    return dataclasses.replace(surface, vertices=corners, faces=np.arange(len(corners)).reshape(-1, 3))
+
+
+class _Files(FilePathResolver):
+    """Finds the files that a mesh names: beside it or elsewhere below a folder, with slashes of either kind."""
+
+    def __init__(self, path: Path, root: Path) -> None:
+        super().__init__(str(path))
+        self._root = root.resolve()
+
+    def get(self, name: str) -> bytes:
+        name = name.strip().replace("\\", "/")
+        for candidate in (name, name.lstrip("/"), name.rpartition("/")[2]):
+            path = Path(self.parent, candidate).resolve()
+            if path.is_relative_to(self._root) and path.is_file():
+                return path.read_bytes()
+        raise FileNotFoundError(name)
+
+
+def _parts(scene: trimesh.Scene) -> list[Surface]:
+    """The scene's meshes where its graph puts them; lines and points are left out."""
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        pose, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+            continue
+        if mesh.faces.max() >= len(mesh.vertices) or mesh.faces.min() < 0:
+            raise MeshError("faces with indices of vertices that it does not have")
+        vertices = np.asarray(mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
+        parts.append(_coloured(mesh, vertices, np.asarray(mesh.faces)))
+    return parts
+
+
+def _coloured(mesh: trimesh.Trimesh, vertices: np.ndarray, faces: np.ndarray) -> Surface:
+    """Texture if there is one, else vertex or face colours, else the material's colour."""
+    visual = mesh.visual
+    colours = np.full((len(faces), 3), 0.7)
+    if isinstance(visual, TextureVisuals):
+        material = visual.material
+        image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+        uv = visual.uv
+        if image is not None and uv is not None and len(uv) == len(vertices) and np.isfinite(uv).all():
+            return Surface(
+                vertices,
+                faces,
+                np.ones((len(faces), 3, 3), np.float32),
+                np.zeros(len(faces), int),
+                np.asarray(uv, np.float32)[faces],
+                (_texture(image),),
+            )
+        colours[:] = np.asarray(material.main_color[:3]) / 255
+    elif isinstance(visual, ColorVisuals) and visual.kind == "vertex":
+        surface = Surface.plain(vertices, faces, colours)
+        corner_colours = np.asarray(visual.vertex_colors)[faces, :3].astype(np.float32) / 255
+        return dataclasses.replace(surface, corner_colours=corner_colours)
+    elif isinstance(visual, ColorVisuals) and visual.kind == "face":
+        colours = np.asarray(visual.face_colors)[:, :3] / 255
+    return Surface.plain(vertices, faces, colours)
+
+
+def _texture(image: Image.Image) -> np.ndarray:
+    """RGB (h, w, 3) uint8, transparency on white."""
+    image = image.convert("RGBA")
+    image.thumbnail((_TEXTURE_SIZE, _TEXTURE_SIZE))
+    ground = Image.new("RGBA", image.size, "white")
+    return np.asarray(Image.alpha_composite(ground, image).convert("RGB"))
+
+
+def _joined(parts: Sequence[Surface]) -> Surface:
+    vertices = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    textures = np.cumsum([0] + [len(part.textures) for part in parts[:-1]])
+    return Surface(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, vertices, strict=True)]),
+        np.concatenate([part.corner_colours for part in parts]),
+        np.concatenate(
+            [
+                np.where(part.face_texture < 0, -1, part.face_texture + start)
+                for part, start in zip(parts, textures, strict=True)
+            ]
+        ),
+        np.concatenate([part.corner_uv for part in parts]),
+        tuple(texture for part in parts for texture in part.textures),
+    )
+
+
+# Ground truth without the inside: samples that are visible in a view, or from outside.
+
+
+def sample_visible(
+    renderer: Renderer, camera: PinholeCamera, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Points (count, 3), uniform by area on the visible part of the surface.
+
+    The bottoms of drawers, and parts inside of others, are left out: no picture shows them. A point is visible if one
+    of the views' cameras (V,) sees it, or one of 64 cameras all around.
+
+    Raises:
+        MeshError: nearly nothing of the surface is visible.
+
+    Example:
+        >>> from train.data.solids import box, surface_of
+        >>> outer, inner = (box((size,) * 3, (0, 0, 0), np.ones(3)) for size in (0.5, 0.4))
+        >>> renderer, rng = Renderer(surface_of([outer, inner])), np.random.default_rng(0)
+        >>> points = sample_visible(renderer, orbit_camera(np.zeros(1), np.zeros(1), 64), 500, rng)
+        >>> bool(np.isclose(np.abs(points).max(1), 0.25).all())
+        True
+    """
+    surface = renderer.surface
+    triangles = surface.vertices[surface.faces]
+    # Cameras evenly over a sphere (a Fibonacci lattice) around all of the shape, which fills their frames.
+    number = np.arange(_CAMERAS)
+    elevation_deg = np.degrees(np.arcsin(1 - (2 * number + 1) / _CAMERAS))
+    azimuth_deg = np.degrees(number * np.pi * (3 - np.sqrt(5)))
+    radius = float(np.linalg.norm(surface.vertices, axis=1).max())
+    around = orbit_camera(azimuth_deg, elevation_deg, _SIZE, Orbit(distance=4 * radius))
+    kept: list[np.ndarray] = []
+    for _ in range(_ROUNDS):
+        points, face = sample_triangles(triangles, _DRAWN_AT_ONCE * count, rng)
+        seen = np.zeros(len(points), bool)
+        for cameras in (camera, around):
+            for number in range(len(cameras.K)):
+                left = np.flatnonzero(~seen)
+                seen[left] = _sees(renderer, cameras, number, points[left], face[left])
+        kept.append(points[seen])
+        if sum(map(len, kept)) >= count:
+            return np.concatenate(kept)[:count]
+    raise MeshError("nearly nothing of its surface is visible from outside")
+
+
+def _sees(
+    renderer: Renderer, camera: PinholeCamera, view: int, points: np.ndarray, face: np.ndarray
+) -> np.ndarray:
+    """(N,) bool: which points (N, 3), each on its face (N,), one of the cameras sees."""
+    hits = renderer.hits(camera, view)
+    K, cam_from_world = camera.K[view].double().numpy(), camera.cam_from_world[view].double().numpy()
+    rotation, translation = cam_from_world[:3, :3], cam_from_world[:3, 3]
+    in_cam = points @ rotation.T + translation
+    depth = in_cam[:, 2]
+    column, row = np.floor(in_cam @ K[:2].T / depth[:, None]).T
+    framed = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    at = row[framed].astype(int), column[framed].astype(int)
+    first, first_depth = hits.face[at], hits.depth[at]
+    eye = -rotation.T @ translation
+    normals = renderer.normals[first]
+    towards = points[framed] - eye
+    with np.errstate(divide="ignore", invalid="ignore"):  # a plane that the ray runs along hides nothing
+        reach = (renderer.offsets[first] - normals @ eye) / np.einsum("nc,nc->n", normals, towards)
+    clear = (reach >= 1 - _SAME) & (first_depth > (1 - _NEAR) * depth[framed])
+    seen = np.zeros(len(points), bool)
+    seen[framed] = clear | (first == face[framed]) | (first < 0)
+    return seen

@@ -53,6 +53,11 @@ class Photo:
         """Its name in reports."""
         return f"{self.object}/{self.path.name}"
 
+    @property
+    def target(self) -> Path:
+        """Its picture, below the new folder."""
+        return Path(self.object, f"{self.name}.png")
+
 
 @dataclasses.dataclass(frozen=True)
 class PhotosReport:
@@ -63,7 +68,7 @@ class PhotosReport:
         kept: photographs that an earlier run had cut out.
         objects: in the folder.
         found: what was found in each photograph of this run, by its title.
-        ways: how many objects were found by a mask, by transparency ("alpha"), by a plain background.
+        ways: how many were found by a mask, by transparency ("alpha"), by a plain background.
         failures: reasons by the title of the photograph.
     """
 
@@ -120,8 +125,7 @@ def convert_photos(
         UserError: no photographs, or not a single usable one; a folder that holds something else.
     """
     source, out = Path(source), Path(out)
-    if not 16 <= size <= 2048:
-        raise UserError(f"size must be between 16 and 2048; got {size}")
+    tree_files.require_between(size=(size, 16, 2048))
     if fewest < 1 or (objects is not None and objects < 1):
         raise UserError(f"fewest and objects must be at least 1; got {fewest} and {objects}")
     by_object, failures = find_photos(source)
@@ -134,8 +138,11 @@ def convert_photos(
     tree_files.prepare_output(out, {"kind": "photos", "size": size})
     for leftover in list(out.glob("**/.*.tmp")):
         leftover.unlink(missing_ok=True)
-    record = _read_record(out)
-    jobs = [_Job(photo, out, size) for photo in chosen if not _is_done(photo, out)]
+    try:
+        earlier = dict(json.loads((out / _RECORD).read_text())).get("found", {})
+    except (OSError, ValueError):
+        earlier = {}
+    jobs = [_Job(photo, out / photo.target, size) for photo in chosen if not (out / photo.target).is_file()]
     found: dict[str, str] = {}
     ways: Counter[str] = Counter()
     for job, result in map_unordered(_cut_one, jobs, processes=processes, title="cutting out", unit="photo"):
@@ -146,14 +153,12 @@ def convert_photos(
             failures[job.photo.title] = str(result)
     kept = len(chosen) - len(jobs)
     if not kept and not found:
-        title, reason = next(iter(failures.items()))
-        others = f" (and {len(failures) - 1} others)" if len(failures) > 1 else ""
         tree_files.discard(out)
-        raise UserError(f"no photograph can be used; {title}: {reason}{others}")
+        raise UserError(f"no photograph can be used; {tree_files.first_of(failures)}")
     found = {job.photo.title: found[job.photo.title] for job in jobs if job.photo.title in found}
-    record = {"found": {**record.get("found", {}), **found}, "left out": failures}
+    record = {"found": {**earlier, **found}, "left out": failures}
     write_text(out / _RECORD, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
-    made = {photo.object for photo in chosen if _is_done(photo, out)}
+    made = {photo.object for photo in chosen if (out / photo.target).is_file()}
     return PhotosReport(out, kept, len(made), found, dict(ways), failures)
 
 
@@ -198,25 +203,15 @@ def _object_of(path: Path, beside: list[Path], source: Path) -> str:
 
 
 def _given_mask(path: Path) -> Path | None:
-    candidates = [path.with_name(f"{path.stem}_mask{ending}") for ending in _ENDINGS]
-    candidates += [
-        path.parent / name / f"{path.stem}{ending}" for name in _MASK_FOLDERS for ending in _ENDINGS
-    ]
+    places = [f"{path.stem}_mask", *(f"{folder}/{path.stem}" for folder in _MASK_FOLDERS)]
+    candidates = (path.parent / f"{place}{ending}" for place in places for ending in _ENDINGS)
     return next((each for each in candidates if each.is_file()), None)
 
 
 class _Job(NamedTuple):
     photo: Photo
-    out: Path
+    target: Path
     size: int
-
-
-def _target(photo: Photo, out: Path) -> Path:
-    return out / photo.object / f"{photo.name}.png"
-
-
-def _is_done(photo: Photo, out: Path) -> bool:
-    return _target(photo, out).is_file()
 
 
 def _cut_one(job: _Job) -> tuple[str, str] | Exception:
@@ -224,11 +219,8 @@ def _cut_one(job: _Job) -> tuple[str, str] | Exception:
     photo = job.photo
     try:
         made = cut_out(read_rgba(photo.path), size=job.size, given=photo.mask and read_rgba(photo.mask))
-        target = _target(photo, job.out)
-        for path, pixels in (
-            (target.parent / MASKS / target.name, made.mask.astype(np.uint8) * 255),
-            (target, made.picture),
-        ):
+        mask = job.target.parent / MASKS / job.target.name
+        for path, pixels in ((mask, made.mask.astype(np.uint8) * 255), (job.target, made.picture)):
             with replacing(path) as temporary:
                 Image.fromarray(pixels).save(temporary, format="PNG")
     except (UserError, OSError) as error:  # a full disk among them, which stops everything
@@ -236,10 +228,3 @@ def _cut_one(job: _Job) -> tuple[str, str] | Exception:
     except Exception as error:  # whatever is wrong with one photograph, the others must be made
         return UserError(f"{type(error).__name__}: {error}")
     return made.way, made.found
-
-
-def _read_record(out: Path) -> dict[str, dict[str, str]]:
-    try:
-        return dict(json.loads((out / _RECORD).read_text()))
-    except (OSError, ValueError):
-        return {}

@@ -64,14 +64,13 @@ class ProceduralReport:
 
     def summary(self) -> str:
         """A line for the terminal."""
-        splits = ", ".join(f"{count} {split}" for split, count in self.counts.items())
+        splits = tree_files.in_words(self.counts)
         earlier = f", {self.kept} were there" if self.kept else ""
         failed = (
             f"; {len(self.failures)} failed: {'; '.join(self.failures.values())}" if self.failures else ""
         )
-        return (
-            f"{self.out}: made {self.made} shapes{earlier} of {', '.join(self.categories)} ({splits}){failed}"
-        )
+        kinds = ", ".join(self.categories)
+        return f"{self.out}: made {self.made} shapes{earlier} of {kinds} ({splits}){failed}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,14 +187,9 @@ def generate(
         raise UserError(
             f"no procedural family {', '.join(unknown) or '(none given)'}; there are: {', '.join(FAMILIES)}"
         )
-    for name, value, low, high in (
-        ("shapes", shapes, 1, 10**6),
-        ("size", size, 16, 2048),
-        ("views", views, 1, 256),
-        ("variants", variants, 1, MODES),
-    ):
-        if not low <= value <= high:
-            raise UserError(f"{name} must be between {low} and {high}; got {value}")
+    tree_files.require_between(
+        shapes=(shapes, 1, 10**6), size=(size, 16, 2048), views=(views, 1, 256), variants=(variants, 1, MODES)
+    )
     if seed < 0:
         raise UserError(f"seed must not be negative; got {seed}")
     settings = {

@@ -1,20 +1,20 @@
 """Views of a surface: exact depth at pixel centres, shaded colour, no OpenGL.
 
-Which face each pixel sees is found by embree, or by the z-buffer of `rasterise` where embree is not installed; the rest
+Which face each pixel sees is found by embree, or by the z-buffer of `rays` where embree is not installed; the rest
 is the same for both.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import torch
 
 from diffpoint.camera import PinholeCamera
-from train.data.embree import EmbreeCaster, has_embree
-from train.data.rasterise import Rasteriser
-from train.data.surface import Hits, Surface
+from train.data.rays import EmbreeCaster, Hits, Rasteriser, has_embree
+from train.data.surface import Surface
 from train.errors import UserError
 
 DISTANCE = 2.0
@@ -26,9 +26,8 @@ MAX_RADIUS = 0.51
 _FARTHEST = 9.0  # the depth files end at 10
 _AMBIENT, _DIFFUSE = 0.35, 0.6  # sum below 1: a white surface stays darker than the white background
 _DARKEST = 0.06  # a black surface still shows its shape
-_LIGHT_IN_CAM = np.array([-0.45, -0.7, -0.9]) / np.linalg.norm(
-    [-0.45, -0.7, -0.9]
-)  # over the viewer's left shoulder
+_LIGHT_IN_CAM = np.array([-0.45, -0.7, -0.9])  # over the viewer's left shoulder
+_LIGHT_IN_CAM /= np.linalg.norm(_LIGHT_IN_CAM)
 _FINER = 2  # a pixel's colour is the mean of so many samples in each direction
 
 
@@ -139,37 +138,35 @@ class Renderer:
         """Views from cameras (V,). Depth and mask at pixel centres; colour is the mean of 2 x 2 rays."""
         images = np.full((*camera.batch_shape, camera.height, camera.width, 3), 255, np.uint8)
         depth = np.full(images.shape[:-1], np.inf, np.float32)
-        for view, (K, cam_from_world) in enumerate(_matrices(camera)):
-            rows, columns = self._window(K, cam_from_world, camera.height, camera.width)
+        for view in range(len(images)):
+            K, cam_from_world, rows, columns, box = self._seen_by(camera, view)
             if rows.size and columns.size:
-                box = np.s_[view, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-                depth[box] = self._caster.cast(K, cam_from_world, rows, columns).depth
-                images[box] = self._colours(K, cam_from_world, rows, columns)
+                depth[view][box] = self._caster.cast(K, cam_from_world, rows, columns).depth
+                images[view][box] = self._colours(K, cam_from_world, rows, columns)
         return Views(images, depth, camera)
 
     def hits(self, camera: PinholeCamera, view: int) -> Hits:
         """The face and depth that one of the cameras (V,) sees at each pixel's centre, (height, width)."""
-        K, cam_from_world = _matrices(camera)[view]
-        rows, columns = self._window(K, cam_from_world, camera.height, camera.width)
-        hits = Hits(
-            np.full((camera.height, camera.width), -1),
-            np.full((camera.height, camera.width), np.inf, np.float32),
-        )
+        K, cam_from_world, rows, columns, box = self._seen_by(camera, view)
+        size = (camera.height, camera.width)
+        hits = Hits(np.full(size, -1), np.full(size, np.inf, np.float32))
         if rows.size and columns.size:
-            box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
             hits.face[box], hits.depth[box] = self._caster.cast(K, cam_from_world, rows, columns)
         return hits
 
-    def _window(
-        self, K: np.ndarray, cam_from_world: np.ndarray, height: int, width: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of the pixels that the surface's bounding box can cover."""
+    def _seen_by(
+        self, camera: PinholeCamera, view: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Any]:
+        """K, cam_from_world in float64; and the pixels that the surface's box can cover: rows, columns, index."""
+        K, cam_from_world = camera.K[view].double().numpy(), camera.cam_from_world[view].double().numpy()
+        rows, columns = np.arange(camera.height), np.arange(camera.width)
         corners = self._box_corners @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
-        if corners[:, 2].min() <= 1e-3:  # the box reaches the camera's plane: no bound
-            return np.arange(height), np.arange(width)
-        pixels = (corners / corners[:, 2:]) @ K[:2].T
-        low, high = np.floor(pixels.min(0)).astype(int) - 1, np.ceil(pixels.max(0)).astype(int) + 1
-        return np.arange(max(low[1], 0), min(high[1], height)), np.arange(max(low[0], 0), min(high[0], width))
+        if corners[:, 2].min() > 1e-3:  # else the box reaches the camera's plane, and there is no bound
+            pixels = (corners / corners[:, 2:]) @ K[:2].T
+            low, high = np.floor(pixels.min(0)).astype(int) - 1, np.ceil(pixels.max(0)).astype(int) + 1
+            rows = rows[max(low[1], 0) : max(high[1], 0)]
+            columns = columns[max(low[0], 0) : max(high[0], 0)]
+        return K, cam_from_world, rows, columns, np.ix_(rows, columns)
 
     def _colours(
         self, K: np.ndarray, cam_from_world: np.ndarray, rows: np.ndarray, columns: np.ndarray
@@ -215,11 +212,6 @@ class Renderer:
             uv = np.einsum("nk,nkc->nc", weights[chosen], surface.corner_uv[face[chosen]])
             albedo[chosen] = _sample_texture(surface.textures[number], uv)
         return albedo
-
-
-def _matrices(camera: PinholeCamera) -> list[tuple[np.ndarray, np.ndarray]]:
-    """K (3, 3) and cam_from_world (4, 4) of each camera, float64."""
-    return list(zip(camera.K.double().numpy(), camera.cam_from_world.double().numpy(), strict=True))
 
 
 def _barycentric(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -113,10 +113,7 @@ def make_camera(K: np.ndarray, cam_from_world: np.ndarray) -> tuple[Tensor, Tens
     Raises:
         ValueError: not finite, wrong shapes or last rows, not invertible, or a pose that is no rigid motion.
     """
-    K_, pose = (
-        torch.from_numpy(np.array(K, np.float32)),
-        torch.from_numpy(np.array(cam_from_world, np.float32)),
-    )
+    K_, pose = (torch.from_numpy(np.array(matrix, np.float32)) for matrix in (K, cam_from_world))
     camera = PinholeCamera(K_, pose, 1, 1)
     rotation = pose[:3, :3].double()
     if float(K_[:2, :2].double().det().abs()) < 1e-6:

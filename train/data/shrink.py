@@ -50,9 +50,12 @@ def shrink(shape: Shape, sizes: Sizes) -> Shape:
     """
     if shape.depth.isinf().flatten(1).all(1).any():
         raise ShapeError(f"{shape.id}: one of its views shows nothing")
-    small = _small_depth(shape, sizes)
-    images = _bytes_at(shape.images, sizes.image_size)
-    return dataclasses.replace(shape, images=images, depth=small.depth.contiguous(), camera=small.camera)
+    depth, camera = _small_depth(shape, sizes)
+    resized = F.interpolate(
+        shape.images, size=sizes.image_size, mode="bilinear", align_corners=False, antialias=True
+    )
+    images = (resized.clamp(0, 1) * 255).round().to(torch.uint8)
+    return dataclasses.replace(shape, images=images, depth=depth.contiguous(), camera=camera)
 
 
 def _small_depth(shape: Shape, sizes: Sizes) -> SmallDepth:
@@ -67,11 +70,6 @@ def _small_depth(shape: Shape, sizes: Sizes) -> SmallDepth:
         )
     pool = decimate_depth if sizes.pool == "decimate" else min_pool_depth
     return pool(shape.depth, shape.camera, size=wanted)
-
-
-def _bytes_at(images: Tensor, size: tuple[int, int]) -> Tensor:
-    resized = F.interpolate(images, size=size, mode="bilinear", align_corners=False, antialias=True)
-    return (resized.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 def decimate_depth(depth: Tensor, camera: PinholeCamera, *, size: int) -> SmallDepth:

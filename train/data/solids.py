@@ -105,10 +105,8 @@ def loft(rings: Sequence[np.ndarray], colour: np.ndarray) -> Solid:
 
 def box(size: Point, centre: Point, colour: np.ndarray) -> Solid:
     """An axis-aligned box."""
-    return loft(
-        [rectangle(size[0], size[1], centre[0], centre[1], centre[2] + s * size[2] / 2) for s in (-1, 1)],
-        colour,
-    )
+    ends = (centre[2] + side * size[2] / 2 for side in (-1, 1))
+    return loft([rectangle(size[0], size[1], centre[0], centre[1], z) for z in ends], colour)
 
 
 def rectangle(width: float, height: float, x: float, y: float, z: float) -> np.ndarray:

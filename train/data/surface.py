@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
 
 import numpy as np
 
@@ -39,13 +38,6 @@ class Surface:
             np.full(count, -1),
             np.zeros((count, 3, 2), np.float32),
         )
-
-
-class Hits(NamedTuple):
-    """What rays through pixels hit first: the face (h, w) int, -1 for none, and its depth float32, +inf for none."""
-
-    face: np.ndarray
-    depth: np.ndarray
 
 
 def sample_triangles(

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
 
 from train.data import tree_files
-from train.data.axis_frames import AS_IT_IS, SAMPLE, Frame, find_frame
 from train.data.categories import CATEGORY_OF, SYNSET_OF, category_of, synset_of
-from train.data.choy_layout import ChoyLayout, find_renderings
-from train.data.release_layout import ReleaseLayout
+from train.data.consistency import AS_IT_IS, SAMPLE, Frame, find_frame
+from train.data.layouts import Layout, layout_of
 from train.data.shape import Shape, ShapeError, is_shape_id
 from train.errors import UserError
 from train.processes import progress_bar
 
-__all__ = ["Shape", "ShapeError", "ShapeTree", "frame_of", "layout_of", "read_shape"]
+__all__ = ["Shape", "ShapeError", "ShapeTree", "frame_of", "read_shape"]
 
 
 class ShapeTree:
@@ -103,68 +101,6 @@ class ShapeTree:
                 spelling = "" if name in SYNSET_OF or name in CATEGORY_OF else " (is it spelt right?)"
                 raise UserError(f"{self.path} has no category {name!r}{spelling}; it has: {known}")
         return wanted
-
-
-class Layout(Protocol):
-    """A way to lay out a tree on disk; shapes are named "synset/model"."""
-
-    root: Path
-
-    @property
-    def has_depth(self) -> bool:
-        """Whether its shapes can be trained on."""
-        ...
-
-    def listed(self, split: str) -> dict[str, list[str]]:
-        """Synset -> the shapes of a split, as the lists name them, whether they exist or not."""
-        ...
-
-    def folder(self, shape: str) -> Path:
-        """The folder with the views of a shape."""
-        ...
-
-    def cloud_file(self, shape: str) -> Path:
-        """The file with the ground-truth cloud of a shape."""
-        ...
-
-    def on_disk(self) -> list[str]:
-        """The shapes that have a folder, listed or not."""
-        ...
-
-    def read(self, shape: str) -> Shape:
-        """A shape in the frames of its files; a `ShapeError` names what is missing or broken."""
-        ...
-
-
-def layout_of(root: str | Path) -> Layout:
-    """How the tree at `root` is laid out.
-
-    Raises:
-        UserError: there is no tree, or it lacks what it needs.
-    """
-    root = Path(root)
-    if (root / tree_files.RENDERS).is_dir():
-        return ReleaseLayout(root)
-    renderings = find_renderings(root)
-    if renderings is None:
-        raise UserError(
-            f"no data at {root}; make some with: python -m train data procedural --out {root} --shapes 400"
-        )
-    return ChoyLayout(root, renderings)
-
-
-def require_depth(roots: Iterable[str | Path]) -> None:
-    """Refuses trees that cannot be trained on.
-
-    Raises:
-        UserError: a tree has no depth maps, or there is no tree.
-    """
-    for root in roots:
-        if not layout_of(root).has_depth:
-            raise UserError(
-                f"{root} has no depth maps, and training needs them; such renderings serve reconstruct and evaluate. "
-                "To train, render the meshes: python -m train data meshes SHAPENET --out DIR"
-            )
 
 
 def read_shape(root: str | Path, shape: str) -> Shape:

@@ -28,7 +28,7 @@ from train.files import remove, replacing, write_text
 RENDERS, CLOUDS, LISTS = "rendered-shapenet", "pcdata_2048", "data_list"
 SPLITS = ("train", "val", "test")
 POINTS = 2048
-_SHARES = {"test": 0.2, "val": 0.1}
+_TEST_SHARE, _VAL_SHARE = 0.2, 0.1
 SETTINGS = "made_with.json"
 """Holds the settings of the command that made the tree; trees from elsewhere lack it."""
 
@@ -110,23 +110,21 @@ def split_shapes(shapes: Iterable[str], *, seed: int) -> dict[str, str]:
     objects: dict[str, list[str]] = defaultdict(list)
     for shape in shapes:
         objects[re.sub(r"_h\d+$", "", shape)].append(shape)
-    fraction = {name: _hash_fraction(f"{seed}:{name}") for name in objects}
+    fraction = {name: hash_fraction(f"{seed}:{name}") for name in objects}
     order = sorted(objects, key=lambda name: fraction[name])
-    split_of = {name: _split_at(fraction[name]) for name in objects}
+    split_of = {
+        name: "test" if at < _TEST_SHARE else "val" if at < _TEST_SHARE + _VAL_SHARE else "train"
+        for name, at in fraction.items()
+    }
     for missing in (split for split in SPLITS if len(order) >= 5 and split not in split_of.values()):
         largest, _ = Counter(split_of.values()).most_common(1)[0]
         split_of[next(name for name in order if split_of[name] == largest)] = missing
     return {shape: split_of[name] for name in order for shape in objects[name]}
 
 
-def _hash_fraction(text: str) -> float:
+def hash_fraction(text: str) -> float:
+    """A number in [0, 1) that depends on the text only."""
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") / 2**64
-
-
-def _split_at(fraction: float) -> str:
-    if fraction < _SHARES["test"]:
-        return "test"
-    return "val" if fraction < _SHARES["test"] + _SHARES["val"] else "train"
 
 
 def prepare_output(out: str | Path, settings: dict) -> None:
@@ -138,13 +136,23 @@ def prepare_output(out: str | Path, settings: dict) -> None:
     out = Path(out)
     marker = out / SETTINGS
     if marker.is_file():
-        changed = _changed_settings(marker, settings)
+        try:
+            earlier = dict(json.loads(marker.read_text()))
+            changed = [
+                f"{key}: {earlier.get(key)!r} there, {value!r} now"
+                for key, value in settings.items()
+                if earlier.get(key) != value
+            ]
+        except ValueError:
+            changed = [f"{marker.name} cannot be read"]
         if changed:
             raise UserError(
                 f"{out} holds data made with other settings ({'; '.join(changed)}); "
                 "choose another --out, or delete the folder"
             )
-        _remove_leftovers(out)
+        for pattern in (f"{RENDERS}/*/.*.tmp", f"{CLOUDS}/*/.*"):  # half-written by a run that was killed
+            for leftover in out.glob(pattern):
+                remove(leftover)
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(
@@ -157,25 +165,6 @@ def prepare_output(out: str | Path, settings: dict) -> None:
         raise UserError(f"cannot write to {out} ({error.strerror}); choose another --out") from error
 
 
-def _changed_settings(marker: Path, settings: dict) -> list[str]:
-    try:
-        earlier = dict(json.loads(marker.read_text()))
-    except ValueError:
-        return [f"{marker.name} cannot be read"]
-    return [
-        f"{key}: {earlier.get(key)!r} there, {value!r} now"
-        for key, value in settings.items()
-        if earlier.get(key) != value
-    ]
-
-
-def _remove_leftovers(root: Path) -> None:
-    """Deletes the half-written files of a run that was killed."""
-    for pattern in (f"{RENDERS}/*/.*.tmp", f"{CLOUDS}/*/.*"):
-        for leftover in root.glob(pattern):
-            remove(leftover)
-
-
 def discard(root: str | Path) -> None:
     """Removes a dataset in which nothing could be made."""
     root = Path(root)
@@ -183,3 +172,25 @@ def discard(root: str | Path) -> None:
         remove(root / name)
     if not any(root.iterdir()):
         root.rmdir()
+
+
+def require_between(**values: tuple[int, int, int]) -> None:
+    """Refuses options, name=(value, lowest, highest), that are out of range.
+
+    Raises:
+        UserError: one is.
+    """
+    for name, (value, low, high) in values.items():
+        if not low <= value <= high:
+            raise UserError(f"{name} must be between {low} and {high}; got {value}")
+
+
+def in_words(counts: dict[str, int]) -> str:
+    """For instance "7 train, 1 val, 2 test"."""
+    return ", ".join(f"{count} {name}" for name, count in counts.items())
+
+
+def first_of(failures: dict[str, str]) -> str:
+    """The first of these reasons by name, and how many others there are."""
+    name, reason = next(iter(failures.items()))
+    return f"{name}: {reason}" + (f" (and {len(failures) - 1} others)" if len(failures) > 1 else "")

@@ -26,7 +26,6 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from models import Predictor
 from train.config import FitConfig
@@ -46,6 +45,7 @@ from train.evaluation.retrieval import medoid, nearest_by_image
 from train.evaluation.runs import open_run
 from train.evaluation.sensitivity import sensitivity
 from train.files import write_text
+from train.processes import progress_bar
 from train.show.summary import format_result
 
 VIEW_COUNTS = (1, 2, 4, 8)
@@ -145,7 +145,10 @@ def _measure(
     # A step of descent over n views compares n (n - 1) pairs of clouds: the bar counts these, not shapes.
     work = {n: n * n for n in counts}
     total = len(seeds) * len(test) * sum(work.values())
-    with tqdm(total=total, disable=not progress, bar_format="{l_bar}{bar}| {elapsed} < {remaining}") as bar:
+    bar_format = "{l_bar}{bar}| {elapsed} < {remaining}"
+    with progress_bar(
+        title="evaluation", unit="pair", total=total, progress=progress, bar_format=bar_format
+    ) as bar:
         for n in counts:
             bar.set_description(f"{n} view{'s' if n > 1 else ''}")
             for settings, table in zip(ways, tables, strict=True):

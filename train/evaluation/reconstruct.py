@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from diffpoint.io import write_points
-from train.data.choy_layout import pictures_of
 from train.data.cutout import cut_out
 from train.data.images import is_cut_out, read_images, read_rgba
+from train.data.layouts import pictures_of
 from train.errors import UserError
 from train.evaluation.inference import reconstruct
 from train.evaluation.runs import open_run

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, visible_points
 from diffpoint.visibility import Method
-from train.data.embree import load_embree
 from train.data.procedural import variants_of
+from train.data.rays import EmbreeCaster
 from train.data.render import draw_camera
 from train.data.solids import sample_union, surface_of
 from train.data.surface import Surface
@@ -58,14 +58,13 @@ def make_scene(
     counts: Sequence[int],
     sample: Callable[[int, np.random.Generator], np.ndarray],
 ) -> Scene:
-    """A scene of one surface, from 8 of the paper's views.
+    """A surface from 8 of the paper's views, with clouds of several sizes.
 
-    Args:
-        name: of the shape.
-        category: of the shape.
-        surface: hides points. Faces inside it may stay: a ray from outside never meets them first.
-        counts: how many points the clouds have.
-        sample: draws that many points (N, 3) on the outside of the surface.
+    Faces inside the surface may stay: a ray from outside never meets them first. Points (N, 3) come from
+    `sample(N, rng)`, which draws them on the outside.
+
+    Raises:
+        UserError: embree does not run here.
     """
     rng = np.random.default_rng(len(surface.faces))
     rays = Rays(surface)
@@ -87,21 +86,8 @@ def embedded_scene(category: str, seed: int, counts: Sequence[int]) -> Scene:
     return make_scene(f"seed {seed}", f"procedural {category}", surface_of(solids), counts, sample)
 
 
-class Rays:
-    """Ray casting against one surface.
-
-    Raises:
-        UserError: embree does not run here.
-    """
-
-    def __init__(self, surface: Surface) -> None:
-        rtcore_scene, mesh_construction = load_embree()
-        self._scene: Any = rtcore_scene.EmbreeScene()
-        mesh_construction.TriangleMesh(
-            scene=self._scene,
-            vertices=np.ascontiguousarray(surface.vertices, np.float32),
-            indices=np.ascontiguousarray(surface.faces, np.int32),
-        )
+class Rays(EmbreeCaster):
+    """Ray casting from an eye to points, against one surface."""
 
     def behind(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
         """(N,) distance of each point (N, 3) behind what the ray to it meets first; 0 if that is the point itself."""
@@ -114,13 +100,7 @@ class Rays:
 
 
 def quality(
-    scenes: Sequence[Scene],
-    count: int,
-    size: int,
-    method: Method,
-    *,
-    radius: float | None = None,
-    tolerance: float | None = None,
+    scenes: Sequence[Scene], count: int, size: int, method: Method, **options: Any
 ) -> dict[str, float]:
     """The share of hidden points that `visible_points` keeps, and the share of visible points that it finds.
 
@@ -129,18 +109,18 @@ def quality(
         count: points of the clouds.
         size: pixels of a side of the map.
         method: see `visible_points`.
-        radius: see `visible_points`.
-        tolerance: see `visible_points`.
+        options: others of `visible_points`: radius, tolerance.
 
     Returns:
         Means over all views of all scenes: "hidden", the share of hidden points among those kept (1 - precision), and
         "recall", the share of the visible points that are kept.
     """
-    hidden_share, recall = [], []
+    shares = []
     for scene in scenes:
         camera, cloud = scene.camera.resize(size, size), scene.clouds[count][None]
-        kept = visible_points(cloud, camera, method=method, radius=radius, tolerance=tolerance)[0]
+        kept = visible_points(cloud, camera, method=method, **options)[0]
         hidden = scene.hidden[count]
-        hidden_share.append((kept & hidden).sum(1) / kept.sum(1).clamp(min=1))
-        recall.append((kept & ~hidden).sum(1) / (~hidden).sum(1).clamp(min=1))
-    return {"hidden": float(torch.cat(hidden_share).mean()), "recall": float(torch.cat(recall).mean())}
+        of_kept = (kept & hidden).sum(1) / kept.sum(1).clamp(min=1)
+        shares.append(torch.stack((of_kept, (kept & ~hidden).sum(1) / (~hidden).sum(1).clamp(min=1))))
+    means = torch.cat(shares, 1).mean(1).tolist()
+    return dict(zip(("hidden", "recall"), means, strict=True))

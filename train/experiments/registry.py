@@ -34,10 +34,12 @@ EXPERIMENTS = {
 _MODULES = {
     **dict.fromkeys(("diversity", "single-category", "multi-category", "deterministic"), "paper"),
     **dict.fromkeys(("ablation", "consistency", "views"), "paper"),
-    "one-armed": "one_armed.measure",
     "front-vs-projection": "front_vs_projection.experiment",
 }
 """Where an experiment is that has no module of its own name."""
+
+FORMER_NAMES = {"health": "collapse"}
+"""Names that an experiment had before -> its name; the command line accepts both."""
 
 ABOUT_ALL = {
     "list": "status of every experiment, and how long the missing trainings will take",

@@ -6,14 +6,16 @@ The paper gives one time and one share for clouds of 2048 and of 10 000 points, 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from scipy.spatial import Delaunay
@@ -41,13 +43,12 @@ SIDES = (28, 56, 112, 224)  # pixels
 HEADLINES = (56, 28)
 """Sides of the maps in the text; the first is the released code's, and timed. The paper states none."""
 EPSILONS = (EPSILON, 0.02)
-METHODS: tuple[Method, ...] = ("zbuffer", "horizon")
 _ROUNDS, _QUICK_ROUNDS = (31, 3), (3, 1)
 """Of sampling, and of triangulating, for each shape."""
 _SEED = 0
 _RATIO = "triangulation / z-buffer"
 _COLOURS = ("#1f6f8b", "#c8553d")
-_STYLES = {"zbuffer": ("z-buffer", "o-"), "horizon": ("horizon", "s--")}
+_STYLES: dict[Method, tuple[str, str]] = {"zbuffer": ("z-buffer", "o-"), "horizon": ("horizon", "s--")}
 
 
 def make(study: Study) -> Outcome:
@@ -65,19 +66,25 @@ def make(study: Study) -> Outcome:
     """
     families = list(FAMILIES)[: study.limit]
     scenes = [embedded_scene(family, _SEED, COUNTS) for family in families]
-    key = [families, _SEED, VIEWS, list(COUNTS), list(SIDES), list(METHODS), list(EPSILONS)]
+    key = [families, _SEED, VIEWS, list(COUNTS), list(SIDES), list(_STYLES), list(EPSILONS)]
     found = kept(study.out / "runtime" / "hidden.json", key, lambda: _hidden(scenes))
     rounds = _ROUNDS if study.steps is None else _QUICK_ROUNDS
     times = [_times(scenes, count, rounds, progress=study.progress) for count in COUNTS]
+    info = runtime_info()
     result = {
-        "machine": _machine(),
+        "machine": {
+            "processor": info.processor,
+            "platform": platform.platform(),
+            "cores": os.cpu_count(),
+            "threads": info.threads,
+        },
         "shapes": families,
         "views": VIEWS,
         "elevation_deg": list(Orbit().elevation_deg),
         "sides": list(SIDES),
         "timed": {"side": HEADLINES[0], "rounds": list(rounds)},
         "time": times,
-        "claims": claims(times),
+        "claims": [_claim(row) for row in times],
         **found,
         "paper": [{"points": count, **_with_ratio(PAPER[count])} for count in COUNTS],
     }
@@ -105,41 +112,32 @@ def medians(
 
 def _times(scenes: Sequence[Scene], count: int, rounds: tuple[int, int], *, progress: bool) -> dict[str, Any]:
     """Milliseconds of one cloud in one view: the median over shapes, and each."""
-    bar = progress_bar(scenes, title=f"times, {count} points", unit="shape", progress=progress)
-    by_shape = [_times_of(scene, count, rounds) for scene in bar]
-    each = {name: [milliseconds[name] for milliseconds in by_shape] for name in by_shape[0]}
-    middle = {name: float(np.median(values)) for name, values in each.items()}
-    return {"points": count, **_with_ratio(middle), "by_shape": each}
-
-
-def _times_of(scene: Scene, count: int, rounds: tuple[int, int]) -> dict[str, float]:
-    cloud, camera = scene.clouds[count][None], scene.camera[0].resize(HEADLINES[0], HEADLINES[0])
-    xyz = cloud[0].double().numpy()
-    sampling: dict[str, Callable[[], Any]] = {
-        "zbuffer": lambda: sample_view(cloud, splat_depth(cloud, camera)),
-        "horizon": lambda: sample_view(cloud, visible_points(cloud, camera, method="horizon")),
-    }
-    # In turns by shape only: what is called right after a triangulation finds cold caches, and takes twice its time.
-    # And in the thread's time: on a busy machine, wall-clock time would include other load in long calls and not in
-    # short ones.
-    found = medians(sampling, rounds=rounds[0])
-    return found | medians({"triangulation": lambda: Delaunay(xyz)}, rounds=rounds[1], clock=time.thread_time)
-
-
-def claims(times: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Is sampling ten times faster than triangulating? Over shapes, for every number of points."""
     found = []
-    for row in times:
-        paper = PAPER[row["points"]]
-        z_buffer, triangulation = (np.array([row["by_shape"][name]]) for name in ("zbuffer", "triangulation"))
-        found.append(
-            claim(
-                f"ms, {row['points']} points: 10 x z-buffer sampling < triangulation",
-                triangulation - 10 * z_buffer,
-                paper_gain=paper["triangulation"] - 10 * paper["zbuffer"],
-            )
-        )
-    return found
+    for scene in progress_bar(scenes, title=f"times, {count} points", unit="shape", progress=progress):
+        cloud, camera = scene.clouds[count][None], scene.camera[0].resize(HEADLINES[0], HEADLINES[0])
+        sampling = {
+            "zbuffer": lambda c=cloud, k=camera: sample_view(c, splat_depth(c, k)),
+            "horizon": lambda c=cloud, k=camera: sample_view(c, visible_points(c, k, method="horizon")),
+        }
+        triangulation = {"triangulation": functools.partial(Delaunay, cloud[0].double().numpy())}
+        # In turns by shape only: what is called right after a triangulation finds cold caches, and takes twice its
+        # time. And in the thread's time: on a busy machine, wall-clock time would include other load in long calls and
+        # not in short ones.
+        times = medians(sampling, rounds=rounds[0])
+        found.append(times | medians(triangulation, rounds=rounds[1], clock=time.thread_time))
+    by_shape = pd.DataFrame(found)
+    return {"points": count, **_with_ratio(by_shape.median().to_dict()), "by_shape": by_shape.to_dict("list")}
+
+
+def _claim(times: Mapping[str, Any]) -> dict[str, Any]:
+    """Is sampling ten times faster than triangulating? Over shapes."""
+    paper = PAPER[times["points"]]
+    z_buffer, triangulation = (np.array([times["by_shape"][name]]) for name in ("zbuffer", "triangulation"))
+    return claim(
+        f"ms, {times['points']} points: 10 x z-buffer sampling < triangulation",
+        triangulation - 10 * z_buffer,
+        paper_gain=paper["triangulation"] - 10 * paper["zbuffer"],
+    )
 
 
 def _with_ratio(times: Mapping[str, float]) -> dict[str, float]:
@@ -153,24 +151,9 @@ def _hidden(scenes: Sequence[Scene]) -> dict[str, Any]:
         row = {"epsilon": epsilon, "points": count}
         of_all = torch.stack([scene.hidden[count] for scene in judged]).double().mean().item()
         base.append(row | {"hidden": of_all})
-        for side, method in itertools.product(SIDES, METHODS):
+        for side, method in itertools.product(SIDES, _STYLES):
             grid.append(row | {"side": side, "method": method, **quality(judged, count, side, method)})
     return {"base": base, "grid": grid}
-
-
-def _machine() -> dict[str, Any]:
-    """What the times belong to."""
-    info = runtime_info()
-    return {
-        "processor": info.processor,
-        "platform": platform.platform(),
-        "cores": os.cpu_count(),
-        "threads": info.threads,
-    }
-
-
-def _rows(result: Mapping[str, Any], **wanted: Any) -> list[dict[str, Any]]:
-    return [row for row in result["grid"] if all(row[name] == value for name, value in wanted.items())]
 
 
 def markdown(result: Mapping[str, Any]) -> str:
@@ -194,54 +177,57 @@ def markdown(result: Mapping[str, Any]) -> str:
         times.append([_points(ours), *ours_ms, f"{ours[_RATIO]:.0f}"])
         theirs_ms = (f"{paper['zbuffer']:.1f}", "", f"{paper['triangulation']:.1f}", f"{paper[_RATIO]:.0f}")
         times.append([f"{_points(paper)}, the paper", *theirs_ms])
+    grid: Any = _grid(result)
     hidden = {row["points"]: f"{row['hidden']:.1%}" for row in result["paper"]}
-    for base in result["base"]:
-        where = {name: base[name] for name in ("points", "epsilon")}
-        for method, (name, _) in _STYLES.items():
-            cells = (f"{r['hidden']:.1%} / {r['recall']:.1%}" for r in _rows(result, method=method, **where))
-            theirs = hidden[base["points"]] if method == "zbuffer" else ""
-            title = f"{name}, {_points(base)}, eps {base['epsilon']}"
-            shares.append([title, *cells, f"{base['hidden']:.1%}", theirs])
-    lines = [head, "", how, "", *markdown_lines(["", "z-buffer", "horizon", "triangulation", _RATIO], times)]
-    lines += ["", *claim_lines(result["claims"])]
-    lines += [
-        "",
-        "Share of hidden points among the selected / share of selected points among the visible:",
-        "",
-    ]
+    for base, (method, (name, _)) in itertools.product(result["base"], _STYLES.items()):
+        rows = grid.loc[method, base["epsilon"], :, base["points"]]
+        cells = [f"{row.hidden:.1%} / {row.recall:.1%}" for row in rows.itertuples()]
+        paper = hidden[base["points"]] if method == "zbuffer" else ""
+        title = f"{name}, {_points(base)}, eps {base['epsilon']}"
+        shares.append([title, *cells, f"{base['hidden']:.1%}", paper])
     sides = [f"{side} x {side}" for side in result["sides"]]
-    lines += markdown_lines(["", *sides, "hidden of all", "paper, hidden"], shares)
-    return "\n".join([*lines, "", _summary(result), ""])
+    parts = [
+        [head],
+        [how],
+        markdown_lines(["", "z-buffer", "horizon", "triangulation", _RATIO], times),
+        claim_lines(result["claims"]),
+        ["Share of hidden points among the selected / share of selected points among the visible:"],
+        markdown_lines(["", *sides, "hidden of all", "paper, hidden"], shares),
+        [_summary(result)],
+    ]
+    return "\n\n".join("\n".join(part) for part in parts) + "\n"
+
+
+def _grid(result: Mapping[str, Any]) -> pd.DataFrame:
+    """The shares "hidden" and "recall" by method, epsilon, side of the map and number of points."""
+    return pd.DataFrame(result["grid"]).set_index(["method", "epsilon", "side", "points"]).sort_index()
 
 
 def _summary(result: Mapping[str, Any]) -> str:
     """The tables in words; each pair of numbers is of the two numbers of points."""
-    paper, epsilon = result["paper"], result["base"][0]["epsilon"]
-    first, second = (_rows(result, method="zbuffer", side=side, epsilon=epsilon) for side in HEADLINES)
-    horizon = _rows(result, method="horizon", side=HEADLINES[0], epsilon=epsilon)
-    settings = _rows(result, method="zbuffer", points=paper[0]["points"])
-    maps = [_rows(result, method="zbuffer", side=r["side"], epsilon=r["epsilon"]) for r in settings]
-    nearest = min(maps, key=lambda rows: _difference(rows, paper))
-    size, halved, best = (f"{rows[0]['side']} x {rows[0]['side']}" for rows in (first, second, nearest))
+    grid: Any = _grid(result)
+    epsilon, z_buffer = result["base"][0]["epsilon"], grid.loc["zbuffer"]
+    first, second = (z_buffer.loc[epsilon, side] for side in HEADLINES)
+    horizon = grid.loc["horizon", epsilon, HEADLINES[0]]
+    paper = pd.DataFrame(result["paper"]).set_index("points")
+    difference = (z_buffer["hidden"].unstack() - paper["hidden"]).abs().max(axis=1)
+    best_epsilon, best = difference.idxmin()
+    nearest = z_buffer.loc[best_epsilon, best]
     return (
-        f"For {' and '.join(map(_points, paper))}, view-based sampling is {_pair(result['time'], _RATIO, '.0f')} times "
-        f"as fast as the triangulation (the paper: {_pair(paper, _RATIO, '.0f')}). At eps {epsilon}, "
-        f"{_pair(first, 'hidden')} of what the z-buffer selects is hidden with maps of {size}, "
-        f"{_pair(second, 'hidden')} with {halved}; of all maps and eps, {best} at {nearest[0]['epsilon']} comes "
-        f"nearest to the paper's {_pair(paper, 'hidden')}, with {_pair(nearest, 'hidden')}: at most "
-        f"{100 * _difference(nearest, paper):.1f} percentage points of difference. `horizon` finds "
-        f"{_pair(horizon, 'recall')} of the visible points, and {_pair(horizon, 'hidden')} of what it selects is "
-        f"hidden; the z-buffer of {size} finds {_pair(first, 'recall')}."
+        f"For {' and '.join(map(_points, result['paper']))}, view-based sampling is "
+        f"{_pair(pd.DataFrame(result['time']), _RATIO, '.0f')} times as fast as the triangulation (the paper: "
+        f"{_pair(paper, _RATIO, '.0f')}). At eps {epsilon}, {_pair(first, 'hidden')} of what the z-buffer selects is "
+        f"hidden with maps of {HEADLINES[0]} x {HEADLINES[0]}, {_pair(second, 'hidden')} with {HEADLINES[1]} x "
+        f"{HEADLINES[1]}; of all maps and eps, {best} x {best} at {best_epsilon} comes nearest to the paper's "
+        f"{_pair(paper, 'hidden')}, with {_pair(nearest, 'hidden')}: at most {100 * difference.min():.1f} percentage "
+        f"points of difference. `horizon` finds {_pair(horizon, 'recall')} of the visible points, and "
+        f"{_pair(horizon, 'hidden')} of what it selects is hidden; the z-buffer of {HEADLINES[0]} x {HEADLINES[0]} "
+        f"finds {_pair(first, 'recall')}."
     )
 
 
-def _difference(rows: Sequence[Mapping[str, Any]], paper: Sequence[Mapping[str, Any]]) -> float:
-    """Of the hidden shares from the paper's, the larger one."""
-    return max(abs(ours["hidden"] - theirs["hidden"]) for ours, theirs in zip(rows, paper, strict=True))
-
-
-def _pair(rows: Iterable[Mapping[str, Any]], name: str, form: str = ".1%") -> str:
-    return " and ".join(format(row[name], form) for row in rows)
+def _pair(rows: Any, name: str, form: str = ".1%") -> str:
+    return " and ".join(format(value, form) for value in rows[name])
 
 
 def _about(result: Mapping[str, Any]) -> str:
@@ -254,15 +240,15 @@ def _points(row: Mapping[str, Any]) -> str:
 
 def _figure(result: Mapping[str, Any]) -> Figure:
     """Both shares against the side of the map, for the first epsilon."""
-    epsilon = result["base"][0]["epsilon"]
+    epsilon, grid = result["base"][0]["epsilon"], _grid(result)
     figure = Figure(figsize=(11.5, 4.8), layout="constrained", dpi=110)
     panels = figure.subplots(1, 2)
     for paper, colour in zip(result["paper"], _COLOURS, strict=True):
         for method, (name, style) in _STYLES.items():
-            rows = _rows(result, epsilon=epsilon, points=paper["points"], method=method)
+            rows: Any = 100 * grid.loc[method, epsilon, :, paper["points"]]
             for axes, share in zip(panels, ("hidden", "recall"), strict=True):
-                label, values = f"{name}, {_points(paper)}", [100 * row[share] for row in rows]
-                axes.plot(result["sides"], values, style, color=colour, ms=4.5, label=label)
+                label = f"{name}, {_points(paper)}"
+                axes.plot(result["sides"], rows[share], style, color=colour, ms=4.5, label=label)
         label = f"the paper, {_points(paper)}: {paper['hidden']:.1%}"
         panels[0].axhline(100 * paper["hidden"], color=colour, ls=":", lw=1.2, label=label)
     for axes, chosen, of in zip(panels, ("Hidden", "Visible"), ("selected", "visible"), strict=True):

@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from train.config import FitConfig, PretrainConfig, StageConfig, fit_config_from_json, to_json
 from train.data.batches import Batch, LoadedSplit, Sampler
-from train.data.tree import require_depth
+from train.data.layouts import require_depth
 from train.distributed import SINGLE, World, connect
 from train.errors import UserError
 from train.evaluation.runs import (
@@ -33,7 +32,7 @@ from train.files import write_text
 from train.methods import get_method
 from train.methods.base import Noise, Step, adam, check_finite, set_learning_rate
 from train.methods.weights import save_weights
-from train.processes import StopRequest
+from train.processes import StopRequest, progress_bar
 from train.timer import Timer
 from train.training.checkpoint import load_networks, load_state, save_checkpoint
 from train.training.collapse import CollapseCheck
@@ -128,8 +127,12 @@ def _run_phase(trainer: Trainer, run: _Run) -> bool:
     def due(every: int) -> bool:
         return trainer.done or trainer.step % every == 0
 
-    with tqdm(
-        total=trainer.phase.steps, initial=trainer.step, desc=trainer.phase_name, disable=not run.progress
+    with progress_bar(
+        title=trainer.phase_name,
+        unit="step",
+        total=trainer.phase.steps,
+        initial=trainer.step,
+        progress=run.progress,
     ) as bar:
         timer.reset()
         while not trainer.done:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
-from typing import Literal
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -49,39 +49,33 @@ class OneArmedChair:
     Attributes:
         seed: as `variants_of` takes it.
         side: of the arm that stays.
-        both: the solids of the chair with two arms.
-        one: without the arm on the other side.
-        none: without arms.
+        solids: of the chair with one arm, with both, and with none.
         boxes: (2, 2, 3), where the missing and the present arm would be counted: lowest and highest corner.
         shares: (2,) of the points on the chair with two arms in the box of the missing arm; of those on the chair with
             one in the box of the present one.
-        azimuth_deg: (2,) of views A and B.
-        elevation_deg: (2,).
+        view_deg: (2, 2) azimuths and elevations of views A and B.
         changed: (2,) share of the object's pixels in A and B that change when the arm is taken away.
     """
 
     seed: tuple[int, int]
     side: Side
-    both: list[Solid]
-    one: list[Solid]
-    none: list[Solid]
+    solids: Mapping[Arms, Sequence[Solid]]
     boxes: np.ndarray
     shares: np.ndarray
-    azimuth_deg: np.ndarray
-    elevation_deg: np.ndarray
+    view_deg: np.ndarray
     changed: np.ndarray
 
     def cameras(self, size: int) -> PinholeCamera:
         """Of views A and B (2,), for pictures of `size` pixels a side."""
-        return orbit_camera(self.azimuth_deg, self.elevation_deg, size)
+        return orbit_camera(self.view_deg[0], self.view_deg[1], size)
 
     def images(self, size: int, arms: Arms = "one") -> np.ndarray:
         """Views A and B (2, size, size, 3) uint8."""
-        return Renderer(surface_of(getattr(self, arms))).render(self.cameras(size)).images
+        return Renderer(surface_of(self.solids[arms])).render(self.cameras(size)).images
 
     def samples(self, count: int, arms: Arms = "one") -> np.ndarray:
         """(count, 3) points on the surface."""
-        return sample_union(getattr(self, arms), count, np.random.default_rng([*self.seed, 1]))
+        return sample_union(self.solids[arms], count, np.random.default_rng([*self.seed, 1]))
 
 
 def one_armed_chairs() -> Iterator[OneArmedChair]:
@@ -100,18 +94,22 @@ def make_chair(seed: tuple[int, int], side: Side) -> OneArmedChair | None:
     None if it has not both arms, or too little of an arm in its box, or if no view hides the arm and shows the other.
     """
     both = variants_of("chair", seed)[seed[1] % MODES]
-    arms = {where: arm_of(both, where) for where in (-1, 1)}
-    if not all(arms.values()):
+    present, missing = arm_of(both, side), arm_of(both, -side)
+    if not present or not missing:
         return None
-    one, none = without(both, arms[-side]), without(both, [*arms[-1], *arms[1]])
-    boxes = np.stack([arm_box(arms[-side], none), arm_box(arms[side], none)])
+    solids: dict[Arms, list[Solid]] = {
+        "one": without(both, missing),
+        "both": both,
+        "none": without(both, [*present, *missing]),
+    }
+    boxes = np.stack([arm_box(arm, solids["none"]) for arm in (missing, present)])
     rng = np.random.default_rng(seed)
-    dense = sample_union(both, _DENSE, rng), sample_union(one, _DENSE, rng)
-    shares = np.array([inside(points, box).mean() for points, box in zip(dense, boxes, strict=True)])
+    samples = [sample_union(solids[arms], _DENSE, rng) for arms in ("both", "one")]
+    shares = np.array([inside(points, box).mean() for points, box in zip(samples, boxes, strict=True)])
     if shares.min() < LEAST_SHARE:
         return None
-    views = _find_views(both, one, none, side)
-    return views and OneArmedChair(seed, side, both, one, none, boxes, shares, *views)
+    views = _find_views(solids, side)
+    return views and OneArmedChair(seed, side, solids, boxes, shares, *views)
 
 
 def arm_of(solids: Sequence[Solid], side: Side) -> list[Solid]:
@@ -162,28 +160,25 @@ def inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
     return ((points > box[0]) & (points < box[1])).all(-1)
 
 
-def _find_views(
-    both: Sequence[Solid], one: Sequence[Solid], none: Sequence[Solid], side: Side
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Azimuths, elevations and changed shares of A and B, each (2,); None if nothing hides the arm and shows the other.
+def _find_views(solids: Mapping[Arms, Sequence[Solid]], side: Side) -> tuple[np.ndarray, np.ndarray] | None:
+    """Azimuths and elevations of A and B (2, 2), and changed shares (2,); None if nothing hides the arm and shows the
+    other.
 
     Of the views that are suitable as A, the one farthest from the side, from where the width cannot be seen.
     """
-    from_side, from_front = (
-        np.array(list(itertools.product(azimuths, elevations))).T * ((where,), (1,))
-        for where, (azimuths, elevations) in ((side, _A_DEG), (-side, _B_DEG))
-    )
-    with_both, with_one, with_none = (_render(solids, from_side) for solids in (both, one, none))
-    hidden, shown = _changed(with_both, with_one), _changed(with_one, with_none)
-    told = _changed(*(_render(solids, from_front) for solids in (both, one)))
+    from_side = np.array(list(itertools.product(*_A_DEG))).T * ((side,), (1,))
+    from_front = np.array(list(itertools.product(*_B_DEG))).T * ((-side,), (1,))
+    one, both, none = (_render(solids[arms], from_side) for arms in get_args(Arms))
+    hidden, shown = _changed(both, one), _changed(one, none)
+    revealed = _changed(*(_render(solids[arms], from_front) for arms in ("both", "one")))
     usable = (hidden <= HIDDEN) & (shown >= SHOWN)
-    if not usable.any() or told.max() < SHOWN:
+    if not usable.any() or revealed.max() < SHOWN:
         return None
     oblique = np.abs(np.cos(np.radians(from_side[0]))).round(6)
     usable &= oblique == oblique[usable].max()
-    a, b = int(np.where(usable, shown, 0).argmax()), int(told.argmax())
-    azimuth, elevation = np.stack((from_side[:, a], from_front[:, b]), 1).astype(float)
-    return azimuth, elevation, np.array([hidden[a], told[b]])
+    a, b = int(np.where(usable, shown, 0).argmax()), int(revealed.argmax())
+    view_deg = np.stack((from_side[:, a], from_front[:, b]), 1).astype(float)
+    return view_deg, np.array([hidden[a], revealed[b]])
 
 
 def _render(solids: Sequence[Solid], view_deg: np.ndarray) -> Views:

@@ -1,1 +1,0 @@
-"""A chair with one arm: is the other one invented? Start reading at measure.py."""
