@@ -181,7 +181,7 @@ def test_processes_train_and_measure_the_same(trained: Study, tmp_path: Path) ->
         for stage in (1, 2):
             weights = [best_weights(study.run_of(config), stage).read_bytes() for study in (trained, beside)]
             assert weights[0] == weights[1]
-    assert not any(beside.is_kept(lambda s, cell=cell: measured(s, *cell)) for cell in calls)
+    assert all(beside.first_missing(lambda s, cell=cell: measured(s, *cell)) for cell in calls)
     beside.measure_all(measured, [*calls, calls[0]])  # what is asked for twice is measured once
     assert len(list((tmp_path / "metrics").iterdir())) == len(calls) == 2
     kept = dataclasses.replace(beside, measures=False)
@@ -297,13 +297,13 @@ def test_metrics_outlive_their_runs(trained: Study, tmp_path: Path) -> None:
     assert make(table, elsewhere).result == first
     assert not (tmp_path / "runs").exists()
     (tmp_path / "metrics.safetensors").unlink()
-    assert table.missing(elsewhere) == table.trainings(elsewhere)
+    assert table.trainings(elsewhere, only_missing=True) == table.trainings(elsewhere)
     row = table.rows[0]
     config = table.config(row, trained, seed=0)
     other = dataclasses.replace(row, codes="agreed as in the paper")
-    assert not elsewhere.is_kept(lambda s: measured(s, row, config))
-    assert trained.is_kept(lambda s: measured(s, row, config))
-    assert not trained.is_kept(lambda s: measured(s, other, config))
+    assert elsewhere.first_missing(lambda s: measured(s, row, config))
+    assert trained.first_missing(lambda s: measured(s, row, config)) is None
+    assert trained.first_missing(lambda s: measured(s, other, config))
 
 
 def test_a_verdict_agrees_with_the_numbers(trained: Study) -> None:
@@ -445,7 +445,7 @@ def test_one_page_of_all_results(fresh: Study) -> None:
     assert "1 claims are tested: 1 holds" in text
     assert "| views | a < b | +0.50 [+0.50, +0.50] |  | holds |" in text
     order = [
-        EXPERIMENTS["views"].description, "the page", "More views are better.", "out/views.png", "out/views-more.png",
+        EXPERIMENTS["views"], "the page", "More views are better.", "out/views.png", "out/views-more.png",
         "experiment views --data tiny --out OUT --profile smoke --seeds 1",
     ]  # fmt: skip
     places = [text.index(words) for words in order]

@@ -155,7 +155,7 @@ class Evaluate:
 
 
 def _about_experiments() -> str:
-    everything = {name: entry.description for name, entry in EXPERIMENTS.items()} | ABOUT_ALL
+    everything = EXPERIMENTS | ABOUT_ALL
     lines = "\n\n".join(
         f"{name}: {words}{'' if words[-1] in '?)' else '.'}" for name, words in everything.items()
     )

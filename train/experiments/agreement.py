@@ -11,6 +11,7 @@ Every setting is measured on the same shapes, views and first random codes. Besi
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import itertools
 from collections.abc import Mapping
@@ -20,17 +21,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from scipy.stats import sem
 
 from diffpoint import consistency_loss
-from models import Predictor
 from train.config import FitConfig, InferenceConfig
 from train.data.batches import LoadedSplit
 from train.errors import UserError
-from train.evaluation.per_shape import METRICS, evaluate_split
+from train.evaluation.per_shape import METRICS, concatenate, evaluate_split, stack_seeds
 from train.evaluation.runs import open_run
 from train.experiments.correlation import pearson
-from train.experiments.frame import Experiment, Outcome
-from train.experiments.statistics import spreads, stacked
+from train.experiments.frame import Experiment, Outcome, markdown_page
+from train.experiments.statistics import spreads, transposed
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
 from train.experiments.table import NAMES
@@ -88,34 +89,36 @@ def make(study: Study) -> Outcome:
     if len(test) < 2:
         raise UserError(f"one test shape has no spread; {study.test_tree} must give at least 2")
 
-    seeds = range(study.seeds)
-    of_settings = {
-        name: [_Measurement(each, views, seed) for seed in seeds] for name, each in SETTINGS.items()
+    wanted = {
+        name: [_Measurement(each, views, seed) for seed in range(study.seeds)]
+        for name, each in SETTINGS.items()
     }
-    of_groups = [
-        _Measurement(SETTINGS[_RANDOM], views, 0, tuple(range(first, first + GROUPS)))
-        for first in range(1, 1 + GROUPS * len(seeds), GROUPS)
-    ]
-    everything = [*itertools.chain(*of_settings.values()), *of_groups]
+    code_seeds = [tuple(range(first, first + GROUPS)) for first in range(1, 1 + GROUPS * study.seeds, GROUPS)]
+    wanted["groups"] = [_Measurement(SETTINGS[_RANDOM], views, 0, seeds) for seeds in code_seeds]
+    everything = list(itertools.chain(*wanted.values()))
     study.measure_all(_measured, [(run, each) for each in everything])
     bar = progress_bar(everything, title="settings", unit="measurement", progress=study.progress)
-    found = {each: stacked([_measured(study, run, each)]) for each in bar}  # metric -> (1, draws of codes, M)
-    values = {name: _joined([found[each] for each in every]) for name, every in of_settings.items()}
-    groups = _joined([found[each] for each in of_groups])
-    result: dict[str, Any] = study.about(config) | {
-        "profile": config.profile,  # of the run, whatever the study would train
-        "run": str(run),
-        "shapes": len(test),
-        "fingerprint": test.fingerprint,
-        "views": views,
-        "floor": _floor(test, points=model.points, clouds=views),
-        "ways": {name: _summary(each, values[_RANDOM], SETTINGS[name]) for name, each in values.items()},
-        "correlation": {
-            name: _correlation(groups["consistency"], groups[name])
-            for name in _COLUMNS
-            if name != "consistency"
-        },
+    found = {each: _measured(study, run, each) for each in bar}
+    arrays = {
+        name: {
+            metric: each.double().numpy() for metric, each in concatenate([found[e] for e in every]).items()
+        }
+        for name, every in wanted.items()
     }
+    groups = arrays.pop("groups")
+    result: dict[str, Any] = (
+        study.about(config)
+        | {
+            "profile": config.profile,  # of the run, whatever the study would train
+            "run": str(run),
+            "shapes": len(test),
+            "fingerprint": test.fingerprint,
+            "views": views,
+            "floor": _floor(test, points=model.points, clouds=views),
+            "ways": {name: _summary(each, arrays[_RANDOM], SETTINGS[name]) for name, each in arrays.items()},
+            "correlation": {name: _correlation(groups["consistency"], groups[name]) for name in _COLUMNS[1:]},
+        }
+    )
     return Outcome(result, markdown(result), {"": _figure(result, groups)})
 
 
@@ -126,10 +129,6 @@ agreement = Experiment(
 )
 
 
-def _takes_codes(model: Predictor) -> bool:
-    return getattr(model.config, "deterministic", True) is False
-
-
 def _measured(study: Study, run: Path, what: _Measurement) -> Metrics:
     """Metric -> (C, M) for each draw of codes and each shape, measured now or kept."""
     opened = open_run(run)
@@ -137,11 +136,8 @@ def _measured(study: Study, run: Path, what: _Measurement) -> Metrics:
     settings, views, seed, code_seeds = what
 
     def measure() -> Metrics:
-        draws = [
-            evaluate_split(opened.model, test, settings, views=views, seed=seed, code_seed=draw)
-            for draw in code_seeds
-        ]
-        return {name: torch.stack([draw[name] for draw in draws]) for name in draws[0]}
+        evaluate = functools.partial(evaluate_split, opened.model, test, settings, views=views, seed=seed)
+        return stack_seeds([evaluate(code_seed=draw) for draw in code_seeds])
 
     # The name of a run is not enough: any run can be given, and one that trains on gets other weights.
     weights = hashlib.sha256()
@@ -149,11 +145,6 @@ def _measured(study: Study, run: Path, what: _Measurement) -> Metrics:
         weights.update(name.encode() + values.numpy().tobytes())
     parts = [dataclasses.asdict(settings), views, seed, code_seeds, test.fingerprint]
     return study.kept(["agreement", weights.hexdigest(), *parts], measure)
-
-
-def _joined(found: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Metric -> (draws, M)."""
-    return {name: np.concatenate([each[name][0] for each in found]) for name in found[0]}
 
 
 def _floor(test: LoadedSplit, *, points: int, clouds: int) -> float:
@@ -172,17 +163,14 @@ def _summary(
     found: Mapping[str, np.ndarray], random: Mapping[str, np.ndarray], settings: InferenceConfig
 ) -> dict:
     """A setting's means, their spread over draws, and the change against random codes with its standard error."""
-    by_draw = spreads({name: found[name] for name in METRICS if name in found})
+    by_draw = transposed(spreads({name: found[name] for name in METRICS if name in found}))
     changes = {name: (found[name] - random[name]).mean(0) for name in _COLUMNS}
     return {
         "settings": dataclasses.asdict(settings),
-        "mean": {name: each["mean"] for name, each in by_draw.items()},
-        "sd_over_seeds": {name: each["sd"] for name, each in by_draw.items()},
+        "mean": by_draw["mean"],
+        "sd_over_seeds": by_draw["sd"],
         "against_random": {
-            name: {
-                "mean": change.mean().item(),
-                "standard_error": change.std(ddof=1).item() / len(change) ** 0.5,
-            }
+            name: {"mean": float(change.mean()), "standard_error": float(sem(change))}
             for name, change in changes.items()
         },
         "lowered_share": (found["consistency"] < found["searched"]).mean().item() if settings.steps else None,
@@ -222,36 +210,25 @@ def markdown(result: Mapping[str, Any]) -> str:
         for name, r in result["correlation"].items()
     ]
     heads = ["correlation of consistency loss with", "over groups of codes, within a shape", "over shapes"]
-    return "\n".join([head, "", *markdown_lines(titles, rows), "", *markdown_lines(heads, correlations), ""])
+    return markdown_page(head, markdown_lines(titles, rows), markdown_lines(heads, correlations))
 
 
 def _figure(result: Mapping[str, Any], groups: Mapping[str, np.ndarray]) -> Figure:
     """Left: error against consistency loss of each setting. Right: both over random groups of codes."""
     figure = Figure(figsize=(12, 4.8), layout="constrained", dpi=110)
     left, right = figure.subplots(1, 2)
-    means = [each["mean"] for each in result["ways"].values()]
-    for column, colour in _COLOURS.items():
-        left.plot(
-            [m["consistency"] for m in means],
-            [m[column] for m in means],
-            "o",
-            color=colour,
-            label=NAMES[column],
-        )
-    left.axvline(result["floor"], color=figures.MUTED, ls=":", label="samples of the ground truth")
-    left.set(xlabel="consistency loss x100", ylabel="chamfer distance x100", title="Every setting")
-    left.legend(fontsize=9)
+    means = transposed({name: each["mean"] for name, each in result["ways"].items()})
     centred = {name: (values - values.mean(0)).flatten() for name, values in groups.items()}
     for column, colour in _COLOURS.items():
-        r = result["correlation"][column]["within_shapes"]
-        right.plot(
-            centred["consistency"], centred[column], ".", ms=3, alpha=0.4, color=colour,
-            label=f"{NAMES[column]}, r = {r:+.2f}",
-        )  # fmt: skip
-    right.set(
-        xlabel="consistency loss, less the shape's mean",
-        ylabel="error, less the shape's mean",
-        title="Groups of random codes",
-    )
-    right.legend(fontsize=9)
+        x, y = (list(means[name].values()) for name in ("consistency", column))
+        left.plot(x, y, "o", color=colour, label=NAMES[column])
+        words = f"{NAMES[column]}, r = {result['correlation'][column]['within_shapes']:+.2f}"
+        x, y = centred["consistency"], centred[column]
+        right.plot(x, y, ".", ms=3, alpha=0.4, color=colour, label=words)
+    left.axvline(result["floor"], color=figures.MUTED, ls=":", label="samples of the ground truth")
+    left.set(xlabel="consistency loss x100", ylabel="chamfer distance x100", title="Every setting")
+    loss, error = "consistency loss, less the shape's mean", "error, less the shape's mean"
+    right.set(xlabel=loss, ylabel=error, title="Groups of random codes")
+    for axes in (left, right):
+        axes.legend(fontsize=9)
     return figure

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from matplotlib.figure import Figure
@@ -25,7 +26,7 @@ from train.data.batches import LoadedSplit
 from train.errors import UserError
 from train.evaluation.runs import read_split
 from train.evaluation.sensitivity import sensitivity
-from train.experiments.frame import Experiment, Outcome
+from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.paper import without_critic
 from train.experiments.study import Study, stage1_of
 from train.files import kept
@@ -63,11 +64,10 @@ def _initialise_as_torch_does(generator: Generator) -> None:
             module.reset_parameters()
 
 
-@dataclasses.dataclass(frozen=True)
-class Variant:
+class Variant(NamedTuple):
     """Choices that are undone: values of the stage, and changes to the network with its fresh weights."""
 
-    stage: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    stage: Mapping[str, Any] = {}
     network: tuple[Callable[[Generator], None], ...] = ()
 
 
@@ -87,65 +87,68 @@ Curve = list[dict[str, float]]
 def make(study: Study) -> Outcome:
     """Trains every variant on every data tree by itself, with every seed."""
     study.need_data()
-    curves: dict[str, dict[str, list[Curve]]] = {}
-    missing = [each for each in _trainings(study) if not _kept_at(study, *each).exists()]
+    trainings = _trainings(study)
+    missing = [each for each in trainings if not each.path.exists()]
     study.side_by_side(_curve, missing, title="trainings")
-    for root, name, seed in progress_bar(
-        _trainings(study), title="trainings", unit="training", progress=study.progress
-    ):
-        curves.setdefault(root.name, {}).setdefault(name, []).append(_curve(study, root, name, seed))
+    curves: dict[str, dict[str, list[Curve]]] = {}
+    for each in progress_bar(trainings, title="trainings", unit="training", progress=study.progress):
+        curves.setdefault(each.root.name, {}).setdefault(each.variant, []).append(_curve(study, *each))
     result = {
         "profile": study.profile,
         "data": [str(root) for root in study.data],
         "seeds": study.seeds,
-        "steps": _steps(study),
+        "steps": study.steps or STEPS,
         "trees": {
-            tree: {name: _at_the_end(runs) for name, runs in rows.items()} for tree, rows in curves.items()
+            tree: {
+                variant: {
+                    name: [run[-1].get(name, math.nan) for run in runs] for name in (*_COLUMNS, "front")
+                }
+                for variant, runs in rows.items()
+            }
+            for tree, rows in curves.items()
         },
         "curves": curves,
     }
     return Outcome(result, markdown(result), {"": _figure(result)})
 
 
-def _own_trainings(study: Study) -> dict[Path, FitConfig]:
-    return {_kept_at(study, *each): stage1_of(_config(study, *each[1:])) for each in _trainings(study)}
+collapse = Experiment(
+    make,
+    own_trainings=lambda study: {each.path: stage1_of(each.config) for each in _trainings(study)},
+)
 
 
-collapse = Experiment(make, own_trainings=_own_trainings)
+class _Training(NamedTuple):
+    """A training of a variant on a data tree."""
+
+    path: Path
+    """Of its measurements. The name is for people; they belong to the configuration and the tree, which are inside."""
+    root: Path
+    variant: str
+    config: FitConfig
+    """Its stage 2 is not trained."""
 
 
-def _trainings(study: Study) -> list[tuple[Path, str, int]]:
-    """Data tree, variant and seed of every training."""
-    return [(root, name, seed) for root in study.data for name in VARIANTS for seed in range(study.seeds)]
+def _trainings(study: Study) -> list[_Training]:
+    found, steps = [], study.steps or STEPS
+    for root, name, seed in itertools.product(study.data, VARIANTS, range(study.seeds)):
+        base = study.config(without_critic, seed=seed)
+        stage1 = dataclasses.replace(base.stage1.lasting(steps), **VARIANTS[name].stage)
+        path = study.out / "collapse" / f"{root.name}-{name.replace(' ', '-')}-{steps}-seed{seed}.json"
+        found.append(_Training(path, root, name, dataclasses.replace(base, stage1=stage1)))
+    return found
 
 
-def _steps(study: Study) -> int:
-    return study.steps or STEPS
-
-
-def _config(study: Study, name: str, seed: int) -> FitConfig:
-    """A variant's recipe; its stage 2 is not trained."""
-    base = study.config(without_critic, seed=seed)
-    stage = dataclasses.replace(base.stage1.lasting(_steps(study)), **VARIANTS[name].stage)
-    return dataclasses.replace(base, stage1=stage)
-
-
-def _kept_at(study: Study, root: Path, name: str, seed: int) -> Path:
-    """The file's name is for people; its measurements belong to the configuration and the tree, which are inside."""
-    return study.out / "collapse" / f"{root.name}-{name.replace(' ', '-')}-{_steps(study)}-seed{seed}.json"
-
-
-def _curve(study: Study, root: Path, name: str, seed: int) -> Curve:
+def _curve(study: Study, path: Path, root: Path, variant: str, config: FitConfig) -> Curve:
     """The measurements of one training, made now or kept."""
-    config = _config(study, name, seed)
-    key = [name, dataclasses.replace(study, data=(root,)).run_of(config).name]
     size = get_method(config.system).image_size(config)
     read = functools.partial(read_split, config, root, image_size=size, progress=False)
-    return kept(
-        _kept_at(study, root, name, seed),
-        key,
-        lambda: _train(config, VARIANTS[name], read("train"), read("val", limit=config.validation_shapes)),
-    )
+    key = [variant, dataclasses.replace(study, data=(root,)).run_of(config).name]
+
+    def train() -> Curve:
+        return _train(config, VARIANTS[variant], read("train"), read("val", limit=config.validation_shapes))
+
+    return kept(path, key, train)
 
 
 def _train(config: FitConfig, variant: Variant, train: LoadedSplit, val: LoadedSplit) -> Curve:
@@ -167,38 +170,31 @@ def _train(config: FitConfig, variant: Variant, train: LoadedSplit, val: LoadedS
             break
         if trainer.step % every == 0 or trainer.done:
             now = sensitivity(generator, images, seed=config.seed)
-            moved = {
-                "step": trainer.step,
-                "image": now.image,
-                "code": now.code,
-                "dead_share": now.dead_share,
-            }
-            found.append(moved | {name: report[name].item() for name in ("front", "matched_share")})
+            found.append(
+                {"step": trainer.step, "image": now.image, "code": now.code, "dead_share": now.dead_share}
+            )
+            found[-1] |= {name: report[name].item() for name in ("front", "matched_share")}
     found[-1] |= validate(generator, val, seed=config.seed)
     return found
 
 
-def _at_the_end(runs: list[Curve]) -> dict[str, Any]:
-    """The last measurements of each seed's training."""
-    return {name: [run[-1].get(name, math.nan) for run in runs] for name in (*_COLUMNS, "front")}
-
-
 def markdown(result: Mapping[str, Any]) -> str:
     """A table for every data tree."""
-    lines = [
+    head = (
         f"Stage 1 of the profile `{result['profile']}`, {result['steps']} steps, {result['seeds']} seeds; the values "
         "at the end of each training. Image, code: mean chamfer distance x100 between predictions for different "
         "images with one code, and for different codes with one image. Silent: share of the encoder's channels that "
         "are zero everywhere. Matched: share of the observed points that are assigned to a predicted point. CD, "
         "FPS-CD: on the validation split, all views, random codes."
-    ]
+    )
+    tables = []
     for tree, rows in result["trees"].items():
         cells = [
             [name, *(" / ".join(f"{value:.2f}" for value in row[column]) for column in _COLUMNS)]
             for name, row in rows.items()
         ]
-        lines += ["", *markdown_lines([tree, *_COLUMNS.values()], cells)]
-    return "\n".join([*lines, ""])
+        tables.append(markdown_lines([tree, *_COLUMNS.values()], cells))
+    return markdown_page(head, *tables)
 
 
 def _figure(result: Mapping[str, Any]) -> Figure:

@@ -7,6 +7,7 @@ second.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,7 +16,7 @@ from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
 from train.config import InferenceConfig
-from train.experiments.frame import Experiment, Outcome
+from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.statistics import LEVEL, claim, interval, resampled_means, spread, stacked, trainings
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
@@ -25,7 +26,6 @@ from train.show.tables import markdown_lines
 
 VIEWS = 8
 GROUPS = 20
-LEAST_OVER_SHAPES = 0.3
 _RESAMPLES = 2000
 _ERRORS = ("cd", "fps_cd", "gt_to_pred", "pred_to_gt")
 _COLOURED = 6
@@ -34,16 +34,8 @@ _WORDS = {
     "over_shapes_random": "over shapes, random codes",
     "within_shapes": "within a shape, over groups of random codes",
 }
-_CLAIMS = {
-    "over_shapes": (
-        f"CD and consistency loss, over shapes: rank correlation above {LEAST_OVER_SHAPES}",
-        LEAST_OVER_SHAPES,
-    ),
-    "within_shapes": (
-        "CD and consistency loss, over groups of codes of a shape: rank correlation above 0",
-        0.0,
-    ),
-}
+_LEAST = {"over_shapes": ("over shapes", 0.3), "within_shapes": ("over groups of codes of a shape", 0)}
+"""Claimed: Spearman's rho of CD and consistency loss is above this."""
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -61,21 +53,22 @@ def make(study: Study) -> Outcome:
     study.measure_all(_measured, [(seed, views, group) for seed in seeds for group in (None, *range(GROUPS))])
     agreed = stacked([_measured(study, seed, views, None) for seed in seeds])
     groups = [stacked([_measured(study, seed, views, group) for group in range(GROUPS)]) for seed in seeds]
+    together = {name: np.stack([each[name].T for each in groups]) for name in groups[0]}  # each (S, M, G)
     values = {
         "over_shapes": agreed,
-        "over_shapes_random": {name: np.stack([g[name].mean(0) for g in groups]) for name in groups[0]},
-        "within_shapes": {name: np.stack([g[name].swapaxes(0, 1) for g in groups]) for name in groups[0]},
+        "over_shapes_random": {name: each.mean(2) for name, each in together.items()},
+        "within_shapes": together,
     }
     found = {level: {error: {} for error in _ERRORS} for level in _WORDS}
     claims = []
-    for level, arrays in values.items():
-        for error in _ERRORS:
-            for name, coefficient in COEFFICIENTS.items():
-                by_seed, means = correlate(arrays["consistency"], arrays[error], coefficient)
-                found[level][error][name] = spread(by_seed) | {"interval": interval(means)}
-                if level in _CLAIMS and (error, name) == ("cd", "spearman"):
-                    words, least = _CLAIMS[level]
-                    claims.append(claim(words, by_seed[:, None] - least, means=means - least))
+    for (level, arrays), error in itertools.product(values.items(), _ERRORS):
+        for name, coefficient in COEFFICIENTS.items():
+            by_seed, means = correlate(arrays["consistency"], arrays[error], coefficient)
+            found[level][error][name] = spread(by_seed) | {"interval": interval(means)}
+            if level in _LEAST and (error, name) == ("cd", "spearman"):
+                words, least = _LEAST[level]
+                words = f"CD and consistency loss, {words}: rank correlation above {least}"
+                claims.append(claim(words, by_seed[:, None] - least, means=means - least))
     result = study.about(configs[0]) | {
         "shapes": agreed["cd"].shape[1],
         "views": views,
@@ -121,11 +114,12 @@ def spearman(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return pearson(rankdata(a, axis=-1), rankdata(b, axis=-1))
 
 
-Coefficient = Callable[[np.ndarray, np.ndarray], np.ndarray]
-COEFFICIENTS: dict[str, Coefficient] = {"pearson": pearson, "spearman": spearman}
+COEFFICIENTS = {"pearson": pearson, "spearman": spearman}
 
 
-def correlate(a: np.ndarray, b: np.ndarray, coefficient: Coefficient) -> tuple[np.ndarray, np.ndarray]:
+def correlate(
+    a: np.ndarray, b: np.ndarray, coefficient: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
     """The coefficient of two metrics by training, and bootstrap means of it over trainings and shapes.
 
     Args:
@@ -160,7 +154,7 @@ def markdown(result: Mapping[str, Any]) -> str:
         for level, words in _WORDS.items()
         for error in _ERRORS
     ]
-    return "\n".join([head, "", *markdown_lines(["", "Pearson", "Spearman"], rows), ""])
+    return markdown_page(head, markdown_lines(["", "Pearson", "Spearman"], rows))
 
 
 def _cell(found: Mapping[str, Any]) -> str:
@@ -195,8 +189,8 @@ def _figure(result: Mapping[str, Any], agreed: Arrays, groups: Arrays) -> Figure
     for axes in (left, right):
         figures.plain(axes)
     several = f"; shown: seed 0 of {result['seeds']}" if result["seeds"] > 1 else ", seed 0"
-    figure.suptitle(
-        f"Consistency loss and error: {result['shapes']} held-out shapes, {result['views']} views{several}",
-        fontsize=11,
+    words = (
+        f"Consistency loss and error: {result['shapes']} held-out shapes, {result['views']} views{several}"
     )
+    figure.suptitle(words, fontsize=11)
     return figure

@@ -7,8 +7,9 @@ to it than half the distance between two backs ("whole" in the result): the samp
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from diffpoint import PinholeCamera, nearest
+from diffpoint import nearest
 from models import Predictor
 from train.config import FitConfig
 from train.data import ShapeTree, tree_files
@@ -26,8 +27,8 @@ from train.data.procedural import variants_of
 from train.data.render import Renderer, orbit_camera
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
-from train.experiments.frame import Experiment, Outcome
-from train.experiments.paper import highly_diverse, without_codes
+from train.experiments.frame import Experiment, Outcome, markdown_page
+from train.experiments.paper import without_codes
 from train.experiments.statistics import (
     claim,
     claim_lines,
@@ -39,6 +40,7 @@ from train.experiments.statistics import (
 )
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, unchanged
+from train.methods.ours import highly_diverse
 from train.processes import progress_bar
 from train.show import figures
 from train.show.tables import markdown_lines
@@ -67,23 +69,17 @@ _COLUMNS = {
 
 
 class Object(NamedTuple):
-    """An object with several backs.
-
-    Attributes:
-        category: its family.
-        image: (3, H, W) of its front, in [0, 1].
-        camera: the image's.
-        backs: (K, P, 3) samples of each of its shapes.
-        again: (K, P, 3) other samples of the same.
-        limits: `apart` -> `near_distance`.
-    """
+    """An object with several backs."""
 
     category: str
     image: Tensor
-    camera: PinholeCamera
+    """(3, H, W) of its front, in [0, 1]."""
     backs: Tensor
+    """(K, P, 3) samples of each of its shapes."""
     again: Tensor
+    """(K, P, 3) other samples of the same."""
     limits: Mapping[float | None, float]
+    """`apart` -> within this distance of a back a cloud is close to it."""
 
 
 def configs(study: Study) -> list[FitConfig]:
@@ -110,22 +106,28 @@ def make(study: Study) -> Outcome:
             "python -m train data procedural --out DIR"
         )
     size = ShapeTree(study.test_tree, "test")[0].camera.height
-    made: list[Object] = []
 
+    @functools.cache
     def objects() -> list[Object]:
-        if not made:
-            bar = progress_bar(hiders, title="fronts and backs", unit="object", progress=study.progress)
-            made.extend(make_object(hider, size) for hider in bar)
-        return made
+        bar = progress_bar(hiders, title="fronts and backs", unit="object", progress=study.progress)
+        return [make_object(hider, size) for hider in bar]
 
+    inputs = [[NEAR, APART], list(map(list, hiders))]
     rows: dict[str, list[Metrics]] = {}
-    for seed in range(study.seeds):
+    for of_seed in study.configs(unchanged):
         for name, (change, codes) in _NETWORKS.items():
-            found = _measured(study, study.config(change, seed=seed), hiders, objects, codes)
-            for count, metrics in found.items():
-                rows.setdefault(f"{name}, {count} codes" if count > 1 else name, []).append(metrics)
-    retrieved, resampled = _without_network(study, hiders, objects)
-    rows |= {_RETRIEVED: [retrieved], f"{CODES[0]} samples of the backs": [resampled]}
+            network = study.config(change, seed=of_seed.seed)
+            found = study.kept(
+                ["coverage", *study.weights_key(network), list(codes), *inputs],
+                lambda network=network, codes=codes: _predicted(study, network, objects(), codes),
+            )
+            for count in codes:
+                row = f"{name}, {count} codes" if count > 1 else name
+                rows.setdefault(row, []).append(_starting_with(f"{count}/", found))
+    key = ["coverage", "without network", *study.weights_key(config), *inputs]
+    found = study.kept(key, lambda: _without_network(study, config, objects()))
+    rows[_RETRIEVED] = [_starting_with(f"{CODES[0]}/", found)]
+    rows[f"{CODES[0]} samples of the backs"] = [_starting_with(f"resampled {CODES[0]}/", found)]
     per_shape = {name: stacked(by_seed) for name, by_seed in rows.items()}
     categories = np.array([hider.category for hider in hiders])
     result = study.about(config) | {
@@ -147,17 +149,14 @@ coverage = Experiment(make, configs)
 
 def _claims(rows: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict[str, Any]]:
     """What codes are meant for: other backs, and nothing that is none of them."""
-    reached = [
-        claim(f"backs reached, %: {low} < {high}", 100 * (rows[high]["reached"] - rows[low]["reached"]))
-        for low, high in (("deterministic", _CODED[0]), _CODED)
-    ]
-    wrong = [
+    lower_and_higher = [("reached", "deterministic", _CODED[0]), ("reached", *_CODED)]
+    lower_and_higher += [("none", name, _RETRIEVED) for name in _CODED]
+    return [
         claim(
-            f"close to none, %: {name} < {_RETRIEVED}", 100 * (rows[_RETRIEVED]["none"] - rows[name]["none"])
+            f"{_COLUMNS[metric]}, %: {lower} < {higher}", 100 * (rows[higher][metric] - rows[lower][metric])
         )
-        for name in _CODED
+        for metric, lower, higher in lower_and_higher
     ]
-    return [*reached, *wrong]
 
 
 def make_object(hider: AmbiguousObject, size: int) -> Object:
@@ -170,14 +169,16 @@ def make_object(hider: AmbiguousObject, size: int) -> Object:
     camera = orbit_camera(np.array([azimuth]), np.array([cone.elevation_deg]), size)
     views = Renderer(surface_of(variants[0])).render(camera)
     backs, again = (
-        torch.from_numpy(
-            np.stack([sample_union(solids, tree_files.POINTS, rng) for solids in variants])
-        ).float()
+        torch.from_numpy(np.stack([sample_union(v, tree_files.POINTS, rng) for v in variants])).float()
         for _ in range(2)
     )
     image = torch.from_numpy(views.images[0]).permute(2, 0, 1).float() / 255
-    limits = {apart: near_distance(backs, again, apart=apart) for apart in (APART, None)}
-    return Object(hider.category, image, camera[0].to(dtype=torch.float32), backs, again, limits)
+    different = ~torch.eye(len(backs), dtype=torch.bool)
+    limits = {
+        apart: NEAR * hidden_distances(again, backs, apart=apart)[different].min().item()
+        for apart in (APART, None)
+    }
+    return Object(hider.category, image, backs, again, limits)
 
 
 def hidden_distances(clouds: Tensor, backs: Tensor, *, apart: float | None = APART) -> Tensor:
@@ -226,19 +227,11 @@ def reach(distances: Tensor, near: float) -> tuple[float, float]:
     return len(set(which[close].tolist())) / distances.shape[1], (~close).double().mean().item()
 
 
-def near_distance(backs: Tensor, again: Tensor, *, apart: float | None = APART) -> float:
-    """Half the smallest distance between two backs, from other samples of one to the first samples of the other."""
-    distances = hidden_distances(again, backs, apart=apart)
-    between = distances[~torch.eye(len(backs), dtype=torch.bool)]
-    return NEAR * between.min().item()
-
-
 def _judge(obj: Object, clouds: Tensor, counts: Sequence[int]) -> dict[str, float]:
     """For the first so many clouds "COUNT/NAME" of each of `_COLUMNS`, and "COUNT/nearest_whole"."""
     found: dict[str, float] = {}
     for suffix, apart in (("", APART), ("_whole", None)):
-        near = obj.limits[apart]
-        distances = hidden_distances(clouds, obj.backs, apart=apart)
+        near, distances = obj.limits[apart], hidden_distances(clouds, obj.backs, apart=apart)
         for count in counts:
             reached, none = reach(distances[:count], near)
             found |= {f"{count}/reached{suffix}": reached, f"{count}/none{suffix}": none}
@@ -250,29 +243,17 @@ def _over_objects(found: Sequence[Mapping[str, float]]) -> Metrics:
     return {name: torch.tensor([each[name] for each in found], dtype=torch.float64) for name in found[0]}
 
 
-def _of_count(metrics: Metrics, count: int) -> Metrics:
-    return {name.split("/")[1]: v for name, v in metrics.items() if name.split("/")[0] == str(count)}
+def _starting_with(prefix: str, metrics: Metrics) -> Metrics:
+    return {name.removeprefix(prefix): v for name, v in metrics.items() if name.startswith(prefix)}
 
 
-def _measured(
-    study: Study,
-    config: FitConfig,
-    hiders: Sequence[AmbiguousObject],
-    objects: Callable[[], list[Object]],
-    codes: Sequence[int],
-) -> dict[int, Metrics]:
-    """Number of codes -> metrics of a configuration's network over the objects."""
-
-    def measure() -> Metrics:
-        model = study.network(config)
-        bar = progress_bar(objects(), title="predictions", unit="object", progress=study.progress)
-        return _over_objects(
-            [_judge(obj, predict(model, obj.image, max(codes), seed=config.seed), codes) for obj in bar]
-        )
-
-    key = ["coverage", *study.weights_key(config), list(codes), [NEAR, APART], list(map(list, hiders))]
-    found = study.kept(key, measure)
-    return {count: _of_count(found, count) for count in codes}
+def _predicted(study: Study, config: FitConfig, objects: Sequence[Object], codes: Sequence[int]) -> Metrics:
+    """`_judge` over the objects of a network's predictions."""
+    model = study.network(config)
+    bar = progress_bar(objects, title="predictions", unit="object", progress=study.progress)
+    return _over_objects(
+        [_judge(obj, predict(model, obj.image, max(codes), seed=config.seed), codes) for obj in bar]
+    )
 
 
 @torch.no_grad()
@@ -282,35 +263,21 @@ def predict(model: Predictor, image: Tensor, count: int, *, seed: int) -> Tensor
     return model(image[None], codes)[:, 0].contiguous()
 
 
-def _without_network(
-    study: Study, hiders: Sequence[AmbiguousObject], objects: Callable[[], list[Object]]
-) -> tuple[Metrics, Metrics]:
-    """Random training shapes of the category, and samples of the backs themselves, as large as one prediction."""
-    config = study.config(unchanged, seed=0)
-    count = CODES[0]
-
-    def measure() -> Metrics:
-        points = study.network(config).points
-        train = study.split(config, "train")
-        random = np.random.default_rng(0)
-        found = []
-        for obj in objects():
-            same = [i for i, c in enumerate(train.categories) if c == obj.category] or range(len(train))
-            picked = random.choice(np.array(same), size=count)
-            clouds = (
-                train.points[picked][:, :points].contiguous(),
-                obj.again[torch.arange(count) % len(obj.again), :points].contiguous(),
-            )
-            retrieved, resampled = (_judge(obj, each, (count,)) for each in clouds)
-            found.append(retrieved | {f"resampled {name}": value for name, value in resampled.items()})
-        return _over_objects(found)
-
-    key = ["coverage", "without network", *study.weights_key(config), [NEAR, APART], list(map(list, hiders))]
-    found = study.kept(key, measure)
-    resampled = {
-        name.removeprefix("resampled "): v for name, v in found.items() if name.startswith("resampled ")
-    }
-    return _of_count(found, count), _of_count(resampled, count)
+def _without_network(study: Study, config: FitConfig, objects: Sequence[Object]) -> Metrics:
+    """`_judge` over the objects of random training shapes of the category, and as "resampled COUNT/NAME" of samples of
+    the backs themselves; both as large as one prediction."""
+    count, points, train = CODES[0], study.network(config).points, study.split(config, "train")
+    random = np.random.default_rng(0)
+    found = []
+    for obj in objects:
+        same = [i for i, c in enumerate(train.categories) if c == obj.category] or range(len(train))
+        retrieved = train.points[random.choice(np.array(same), size=count)][:, :points].contiguous()
+        resampled = obj.again[torch.arange(count) % len(obj.again), :points].contiguous()
+        of_samples = _judge(obj, resampled, (count,))
+        found.append(
+            _judge(obj, retrieved, (count,)) | {f"resampled {name}": v for name, v in of_samples.items()}
+        )
+    return _over_objects(found)
 
 
 def markdown(result: Mapping[str, Any]) -> str:
@@ -326,22 +293,17 @@ def markdown(result: Mapping[str, Any]) -> str:
         [name, *((spread_text if "nearest" in column else percent_text)(row[column]) for column in _COLUMNS)]
         for name, row in result["rows"].items()
     ]
-    names = list(result["rows"])
     by_category = [
-        [
-            family,
-            *(" / ".join(f"{found[name][k]['mean']:.0%}" for k in ("reached", "none")) for name in names),
-        ]
+        [family, *(f"{row['reached']['mean']:.0%} / {row['none']['mean']:.0%}" for row in found.values())]
         for family, found in result["categories"].items()
     ]
-    lines = [head, "", *markdown_lines(["", *_COLUMNS.values()], rows), "", *claim_lines(result["claims"])]
-    lines += [
-        "",
+    return markdown_page(
+        head,
+        markdown_lines(["", *_COLUMNS.values()], rows),
+        claim_lines(result["claims"]),
         "Backs reached / predictions close to none, by family:",
-        "",
-        *markdown_lines(["", *names], by_category),
-    ]
-    return "\n".join([*lines, ""])
+        markdown_lines(["", *result["rows"]], by_category),
+    )
 
 
 def _figure(study: Study, hiders: Sequence[AmbiguousObject], size: int) -> Figure:
@@ -360,16 +322,11 @@ def _figure(study: Study, hiders: Sequence[AmbiguousObject], size: int) -> Figur
         figures.caption(row[0], hider.category)
         for axes, back in zip(row[1:], obj.backs, strict=False):
             figures.draw_cloud(axes, back, close[0], colours=figures.TRUE)
-        for axes, cloud, distances in zip(
-            row[1 + kinds :], clouds, hidden_distances(clouds, obj.backs), strict=True
-        ):
+        found = hidden_distances(clouds, obj.backs).min(1)
+        for axes, cloud, least, which in zip(row[1 + kinds :], clouds, *found, strict=True):
             figures.draw_cloud(axes, cloud, close[0])
-            least, which = distances.min(0)
-            words = (
-                f"back {int(which) + 1}"
-                if least < obj.limits[APART]
-                else f"none (back {int(which) + 1} is nearest)"
-            )
+            back = f"back {int(which) + 1}"
+            words = back if least < obj.limits[APART] else f"none ({back} is nearest)"
             axes.text(0.5, 0.0, words, transform=axes.transAxes, fontsize=8, ha="center", color=figures.MUTED)
     backs, codes = (f"back {k + 1}" for k in range(kinds)), (f"code {k + 1}" for k in range(_SHOWN_CODES))
     figures.titles(panels, ["the front", *backs, *codes])

@@ -26,7 +26,7 @@ def make(study: Study) -> Outcome:
     in ten equal parts of its steps."""
     configs = study.configs(with_critic)
     result = tabulate(TABLES["critic"], study)
-    study.train_all([c for c in configs if not study.is_kept(lambda s, c=c: _output(s, c))])
+    study.train_all([c for c in configs if study.first_missing(lambda s, c=c: _output(s, c))])
     outputs = [_output(study, config) for config in configs]
     result["critic_output"] = [
         {

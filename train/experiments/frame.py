@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,37 +18,37 @@ from train.show import figures
 
 
 class Outcome(NamedTuple):
-    """What an experiment found.
-
-    Attributes:
-        result: for NAME.json; "claims", if there are any, are those of `statistics.claim`.
-        page: for NAME.md.
-        figures: ending of the file's name ("" or "-something") -> for NAME.png or NAME-something.png.
-    """
+    """What an experiment found."""
 
     result: dict[str, Any]
+    """For NAME.json; "claims", if there are any, are those of `statistics.claim`."""
     page: str
+    """For NAME.md."""
     figures: Mapping[str, Figure]
-
-
-def _none(study: Study) -> list[Any]:
-    return []
+    """Ending of the file's name ("" or "-something") -> for NAME.png or NAME-something.png."""
 
 
 class Experiment(NamedTuple):
-    """An experiment.
-
-    Attributes:
-        make: trains and measures what is missing.
-        trainings: all configurations that it needs.
-        other_inputs: what else decides the outcome: words, and files that are read.
-        own_trainings: of its trainings those that are not runs of `fit`, by the file that each leaves.
-    """
+    """An experiment."""
 
     make: Callable[[Study], Outcome]
-    trainings: Callable[[Study], list[FitConfig]] = _none
-    other_inputs: Callable[[Study], Iterable[str | Path]] = _none
+    """Trains and measures what is missing."""
+    trainings: Callable[[Study], list[FitConfig]] = lambda study: []
+    """All configurations that it needs."""
+    other_inputs: Callable[[Study], Iterable[str | Path]] = lambda study: []
+    """What else decides the outcome: words, and files that are read."""
     own_trainings: Callable[[Study], dict[Path, FitConfig]] = lambda study: {}
+    """Of its trainings those that are not runs of `fit`, by the file that each leaves."""
+
+
+def markdown_page(*blocks: str | Sequence[str]) -> str:
+    """Paragraphs, and the lines of tables and lists, with a blank line between them.
+
+    Example:
+        >>> markdown_page("Errors:", ["- a: 1", "- b: 2"])
+        'Errors:\\n\\n- a: 1\\n- b: 2\\n'
+    """
+    return "\n\n".join(block if isinstance(block, str) else "\n".join(block) for block in blocks) + "\n"
 
 
 def make_experiment(name: str, experiment: Experiment, study: Study) -> dict[str, Any]:

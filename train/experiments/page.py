@@ -23,16 +23,13 @@ def write_page(out: Path) -> Path:
     no experiment may be running there meanwhile.
 
     Args:
-        out: a directory that experiments wrote into, or one with a folder for each data set.
-
-    Returns:
-        The page: OUT.md.
+        out: a directory that experiments wrote into, or one with a folder for each data set; the page is OUT.md.
 
     Raises:
         UserError: there are no results in it.
     """
-    groups = {folder: _results(folder) for folder in [out, *sorted(p for p in out.glob("*") if p.is_dir())]}
-    groups = {folder: found for folder, found in groups.items() if found}
+    folders = [out, *sorted(path for path in out.glob("*") if path.is_dir())]
+    groups = {folder: found for folder in folders if (found := _results(folder))}
     if not groups:
         raise UserError(
             f"{out} holds no results; make some with: python -m train experiment views --out {out} ..."
@@ -45,8 +42,7 @@ def write_page(out: Path) -> Path:
         if folder != out:
             lines += ["", f"## Data: {folder.name}", "", _text(folder / "README.md")]
         for name, result in found.items():
-            description = EXPERIMENTS[name].description
-            lines += ["", f"{'##' if folder == out else '###'} {name}", "", f"*{description}*", ""]
+            lines += ["", f"{'##' if folder == out else '###'} {name}", "", f"*{EXPERIMENTS[name]}*", ""]
             lines += [_section(folder, name, result, page.parent)]
     write_text(page, "\n".join([*lines, ""]))
     return page

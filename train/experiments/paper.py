@@ -12,30 +12,11 @@ from train.config import FitConfig
 from train.data.batches import LoadedSplit
 from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate
 from train.experiments.store import Metrics
-from train.experiments.study import Change, Study, of_method, unchanged
-from train.experiments.table import Claim, Row, Table, below
+from train.experiments.study import Change, Study, after_stage1, of_method, unchanged
+from train.experiments.table import Claim, Row, Table, below, falls_more, rising
 from train.experiments.ten_predictions import ten_predictions
-from train.methods import get_method, ours
-
-
-def without_codes(config: FitConfig) -> FitConfig:
-    """Our method without latent codes."""
-    return dataclasses.replace(config, deterministic=True)
-
-
-def with_critic(config: FitConfig) -> FitConfig:
-    """The paper's weight for the critic in both stages."""
-    return _both_stages(config, gamma=0.1)
-
-
-def without_critic(config: FitConfig) -> FitConfig:
-    """No critic, and no auto-encoder for it."""
-    return _both_stages(config, gamma=0.0)
-
-
-def without_diversity(config: FitConfig) -> FitConfig:
-    """Latent codes, and no loss that makes predictions differ by them."""
-    return _both_stages(config, beta=0.0)
+from train.methods import get_method
+from train.methods.ours import highly_diverse
 
 
 def _both_stages(config: FitConfig, **changes: float) -> FitConfig:
@@ -43,18 +24,19 @@ def _both_stages(config: FitConfig, **changes: float) -> FitConfig:
     return dataclasses.replace(config, **stages)
 
 
-def with_beta(beta: float) -> Change:
-    """Another weight of the diversity loss in stage 1; the paper's is 10."""
-    return functools.partial(_with_beta, beta=beta)
-
-
-def _with_beta(config: FitConfig, *, beta: float) -> FitConfig:
+def _with_beta(config: FitConfig, beta: float) -> FitConfig:
     return dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, beta=beta))
 
 
-def highly_diverse(config: FitConfig) -> FitConfig:
-    """The paper's model with more diverse predictions."""
-    return ours.highly_diverse(config)
+# Functions and partials, not lambdas: worker processes get them pickled.
+without_codes: Change = functools.partial(dataclasses.replace, deterministic=True)
+"""Our method without latent codes."""
+with_critic: Change = functools.partial(_both_stages, gamma=0.1)
+"""The paper's weight for the critic in both stages."""
+without_critic: Change = functools.partial(_both_stages, gamma=0.0)
+"""No critic, and no auto-encoder for it."""
+without_diversity: Change = functools.partial(_both_stages, beta=0.0)
+"""Latent codes, and no loss that makes predictions differ by them."""
 
 
 def second_stage_without_diversity(config: FitConfig) -> FitConfig:
@@ -64,9 +46,7 @@ def second_stage_without_diversity(config: FitConfig) -> FitConfig:
 
 def second_stage_alone(config: FitConfig) -> FitConfig:
     """Joined views from the first step, from fresh weights; the collapse check belongs to stage 1."""
-    return dataclasses.replace(
-        config, stage1=dataclasses.replace(config.stage1, steps=0), min_image_sensitivity=0.0
-    )
+    return dataclasses.replace(after_stage1(config), min_image_sensitivity=0.0)
 
 
 _RESAMPLED = "samples of the ground truth"
@@ -76,27 +56,25 @@ DIVERSITY = Table(
     rows=(
         *(
             Row(
-                name=name, change=change, stage=1, measure=ten_predictions, critic_of=with_critic,
-                paper={"diversity": theirs},
+                name, change=change, stage=1, measure=ten_predictions, critic_of=with_critic, paper={"diversity": paper}
             )
-            for name, change, theirs in (
+            for name, change, paper in (
                 ("whole clouds (EMD) + MoN", of_method("psgn-mon"), 1.65),
                 ("front constraint", without_diversity, 0.55),
                 ("front constraint + MoN", of_method("front-mon"), 2.52),
-                ("diversity loss, beta 1", with_beta(1.0), 2.88),
-                ("diversity loss, beta 5", with_beta(5.0), 3.18),
+                ("diversity loss, beta 1", functools.partial(_with_beta, beta=1.0), 2.88),
+                ("diversity loss, beta 5", functools.partial(_with_beta, beta=5.0), 3.18),
                 ("diversity loss, beta 10", unchanged, 3.36),
             )
         ),
-        Row(name=_RESAMPLED, source="truth", measure=ten_predictions, critic_of=with_critic),
+        Row(_RESAMPLED, source="truth", measure=ten_predictions, critic_of=with_critic),
     ),
     claims=(
         below("diversity", "front constraint", "diversity loss, beta 10", times=3),
-        below("diversity", "front constraint", "whole clouds (EMD) + MoN"),
-        below("diversity", "whole clouds (EMD) + MoN", "front constraint + MoN"),
-        below("diversity", "front constraint + MoN", "diversity loss, beta 1"),
-        below("diversity", "diversity loss, beta 1", "diversity loss, beta 5"),
-        below("diversity", "diversity loss, beta 5", "diversity loss, beta 10"),
+        *rising(
+            "diversity", "front constraint", "whole clouds (EMD) + MoN", "front constraint + MoN",
+            "diversity loss, beta 1", "diversity loss, beta 5", "diversity loss, beta 10",
+        ),
         below("diversity", _RESAMPLED, "diversity loss, beta 10"),
     ),
 )  # fmt: skip
@@ -130,33 +108,30 @@ SINGLE_CATEGORY = Table(
     of_one_category=True,
     columns=("gt_to_pred", "pred_to_gt", "cd", "fps_cd", "fps_pred_to_gt", "best_cd"),
     rows=(
-        Row(name="3D-R2N2", change=of_method("r2n2"), views=5, paper=_R2N2),
-        Row(name="3D-R2N2, one image", change=of_method("r2n2"), views=1),
-        Row(name="PTN", change=of_method("ptn"), paper=_PTN),
-        Row(name="PSGN", change=of_method("psgn"), paper=_PSGN),
-        Row(name="PSGN, views joined", change=of_method("psgn"), scored="joined"),
-        Row(name="Lin et al., fixed views alone", change=of_method("lin"), stage=1),
-        Row(name="Lin et al.", change=of_method("lin"), paper=_LIN),
-        Row(name="ours", paper=_OURS),
-        Row(name="ours, random codes", codes="random"),
-        Row(name="nearest training shape by image", source="nearest image"),
-        Row(name="medoid of the training shapes", source="medoid"),
+        Row("3D-R2N2", change=of_method("r2n2"), views=5, paper=_R2N2),
+        Row("3D-R2N2, one image", change=of_method("r2n2"), views=1),
+        Row("PTN", change=of_method("ptn"), paper=_PTN),
+        Row("PSGN", change=of_method("psgn"), paper=_PSGN),
+        Row("PSGN, views joined", change=of_method("psgn"), scored="joined"),
+        Row("Lin et al., fixed views alone", change=of_method("lin"), stage=1),
+        Row("Lin et al.", change=of_method("lin"), paper=_LIN),
+        Row("ours", paper=_OURS),
+        Row("ours, random codes", codes="random"),
+        Row("nearest training shape by image", source="nearest image"),
+        Row("medoid of the training shapes", source="medoid"),
         # Errors on the training shapes, and of the representation alone, help to explain an order.
         *(
-            Row(name=f"{name}, its training shapes", change=of_method(method), views=views, split="train")
+            Row(f"{name}, its training shapes", change=of_method(method), views=views, split="train")
             for name, method, views in _OTHERS
         ),
-        Row(name="ours, its training shapes, random codes", codes="random", split="train"),
+        Row("ours, its training shapes, random codes", codes="random", split="train"),
         *(
-            Row(name=f"{name}, oracle", change=of_method(method), source="truth", measure=_oracle)
+            Row(f"{name}, oracle", change=of_method(method), source="truth", measure=_oracle)
             for name, method, _ in _OTHERS
         ),
     ),
     claims=(
-        below("cd", "ours", "Lin et al."),
-        below("cd", "Lin et al.", "PSGN"),
-        below("cd", "PSGN", "PTN"),
-        below("cd", "PTN", "3D-R2N2"),
+        *rising("cd", "ours", "Lin et al.", "PSGN", "PTN", "3D-R2N2"),
         below("cd", "PTN", "3D-R2N2, one image"),
         below("cd", "ours", "PSGN"),
         below("fps_cd", "ours", "PSGN"),
@@ -170,9 +145,9 @@ MULTI_CATEGORY = Table(
     columns=("gt_to_pred", "pred_to_gt", "cd", "fps_cd"),
     rows=(
         # The paper's 5.68 is a mean of categories, its other figures are means of shapes.
-        Row(name="3D-R2N2", change=of_method("r2n2"), views=5, paper={"cd": 5.51}),
-        Row(name="PSGN", change=of_method("psgn"), paper={"cd": 4.39, "fps_cd": 4.39}),
-        Row(name="ours", paper={"cd": 3.58, "fps_cd": 4.34}),
+        Row("3D-R2N2", change=of_method("r2n2"), views=5, paper={"cd": 5.51}),
+        Row("PSGN", change=of_method("psgn"), paper={"cd": 4.39, "fps_cd": 4.39}),
+        Row("ours", paper={"cd": 3.58, "fps_cd": 4.34}),
     ),
     claims=(
         below("cd", "ours", "PSGN"),
@@ -190,18 +165,17 @@ MULTI_CATEGORY = Table(
 DETERMINISTIC = Table(
     title="Do latent codes lower the error of a single reconstruction?",
     rows=(
-        Row(name="conditional", paper={"cd": 3.37, "fps_cd": 4.08}),
-        Row(name="conditional, random codes", codes="random"),
-        Row(name="conditional, without the diversity loss", change=without_diversity, codes="random"),
-        Row(name="deterministic", change=without_codes, paper={"cd": 3.62, "fps_cd": 4.18}),
-        Row(name="nearest training shape by image", source="nearest image"),
-        Row(name="medoid of the training shapes", source="medoid"),
+        Row("conditional", paper={"cd": 3.37, "fps_cd": 4.08}),
+        Row("conditional, random codes", codes="random"),
+        Row("conditional, without the diversity loss", change=without_diversity, codes="random"),
+        Row("deterministic", change=without_codes, paper={"cd": 3.62, "fps_cd": 4.18}),
+        Row("nearest training shape by image", source="nearest image"),
+        Row("medoid of the training shapes", source="medoid"),
     ),
-    claims=(
-        below("cd", "conditional", "deterministic"),
-        below("fps_cd", "conditional", "deterministic"),
-        below("cd", "conditional, without the diversity loss", "deterministic"),
-        below("fps_cd", "conditional, without the diversity loss", "deterministic"),
+    claims=tuple(
+        below(metric, row, "deterministic")
+        for row in ("conditional", "conditional, without the diversity loss")
+        for metric in ("cd", "fps_cd")
     ),
     # In the categories with hidden parts, codes may help.
     category_claims=(below("cd", "conditional", "deterministic"),),
@@ -210,10 +184,10 @@ DETERMINISTIC = Table(
 CRITIC = Table(
     title="Does the latent critic lower the error?",
     rows=(
-        Row(name="without", change=without_critic),
-        Row(name="with (gamma 0.1)", change=with_critic),
-        Row(name="without, after stage 1", change=without_critic, stage=1),
-        Row(name="with, after stage 1", change=with_critic, stage=1),
+        Row("without", change=without_critic),
+        Row("with (gamma 0.1)", change=with_critic),
+        Row("without, after stage 1", change=without_critic, stage=1),
+        Row("with, after stage 1", change=with_critic, stage=1),
     ),
     claims=(below("cd", "with (gamma 0.1)", "without"), below("fps_cd", "with (gamma 0.1)", "without")),
 )
@@ -227,65 +201,51 @@ _BOTH, _SEARCHED, _AGREED = (
 ABLATION = Table(
     title="What do the stages, the diversity loss in stage 2, and search and descent on the codes contribute?",
     rows=(
-        Row(name=_S1, stage=1, codes="random", paper={"cd": 3.97, "fps_cd": 6.30}),
-        Row(name=_S1_AGREED, stage=1, paper={"cd": 3.87, "fps_cd": 5.77}),
-        Row(
-            name=_PLAIN,
-            change=second_stage_without_diversity,
-            codes="random",
-            paper={"cd": 3.51, "fps_cd": 4.18},
-        ),
-        Row(name=_BOTH, codes="random", paper={"cd": 3.40, "fps_cd": 4.16}),
-        Row(name=_SEARCHED, codes="searched"),
-        Row(name=_ALONE, change=second_stage_alone, paper={"cd": 3.52, "fps_cd": 4.24}),
-        Row(name=_AGREED, paper={"cd": 3.37, "fps_cd": 4.08}),
+        Row(_S1, stage=1, codes="random", paper={"cd": 3.97, "fps_cd": 6.30}),
+        Row(_S1_AGREED, stage=1, paper={"cd": 3.87, "fps_cd": 5.77}),
+        Row(_PLAIN, change=second_stage_without_diversity, codes="random", paper={"cd": 3.51, "fps_cd": 4.18}),
+        Row(_BOTH, codes="random", paper={"cd": 3.40, "fps_cd": 4.16}),
+        Row(_SEARCHED, codes="searched"),
+        Row(_ALONE, change=second_stage_alone, paper={"cd": 3.52, "fps_cd": 4.24}),
+        Row(_AGREED, paper={"cd": 3.37, "fps_cd": 4.08}),
     ),
     claims=(
-        Claim(
+        falls_more(
             "FPS-CD: stage 2 gains more than agreement after stage 1",
-            lambda r: (
-                r[_S1_AGREED]["fps_cd"] - r[_AGREED]["fps_cd"] - (r[_S1]["fps_cd"] - r[_S1_AGREED]["fps_cd"])
-            ),
+            "fps_cd", (_S1_AGREED, _AGREED), (_S1, _S1_AGREED),
         ),
         below("fps_cd", _AGREED, _S1_AGREED),
         below("cd", _BOTH, _S1),
-        below("cd", _BOTH, _PLAIN),
-        below("fps_cd", _BOTH, _PLAIN),
-        below("cd", _AGREED, _ALONE),
-        below("fps_cd", _AGREED, _ALONE),
-        below("cd", _S1_AGREED, _S1),
-        below("fps_cd", _S1_AGREED, _S1),
-        below("cd", _AGREED, _BOTH),
-        below("fps_cd", _AGREED, _BOTH),
-        Claim(
+        *(
+            below(metric, lower, higher)
+            for lower, higher in ((_BOTH, _PLAIN), (_AGREED, _ALONE), (_S1_AGREED, _S1), (_AGREED, _BOTH))
+            for metric in ("cd", "fps_cd")
+        ),
+        falls_more(
             "FPS-CD: agreement helps more after stage 1 than after both",
-            lambda r: (
-                r[_S1]["fps_cd"] - r[_S1_AGREED]["fps_cd"] - (r[_BOTH]["fps_cd"] - r[_AGREED]["fps_cd"])
-            ),
+            "fps_cd", (_S1, _S1_AGREED), (_BOTH, _AGREED),
         ),
     ),
-)
+)  # fmt: skip
 
 CONSISTENCY = Table(
     title="How do search and descent change the highly diverse model?",
     columns=("gt_to_pred", "pred_to_gt", "cd", "fps_cd", "consistency"),
     rows=(
         Row(
-            name="random codes", change=highly_diverse, codes="random",
+            "random codes", change=highly_diverse, codes="random",
             paper={"gt_to_pred": 1.40, "pred_to_gt": 7.76, "cd": 9.15, "consistency": 13.96},
         ),
         Row(
-            name="searched", change=highly_diverse, codes="searched",
+            "searched", change=highly_diverse, codes="searched",
             paper={"gt_to_pred": 1.41, "pred_to_gt": 3.24, "cd": 4.65, "consistency": 5.96},
         ),
         Row(
-            name="searched and descended", change=highly_diverse,
+            "searched and descended", change=highly_diverse,
             paper={"gt_to_pred": 1.40, "pred_to_gt": 2.80, "cd": 4.21, "consistency": 4.66},
         ),
-        Row(
-            name="searched and descended, 30 steps of 0.5", change=highly_diverse, codes="agreed as in the paper"
-        ),
-        Row(name="the main model, random codes", codes="random"),
+        Row("searched and descended, 30 steps of 0.5", change=highly_diverse, codes="agreed as in the paper"),
+        Row("the main model, random codes", codes="random"),
     ),
     claims=(
         below("consistency", "searched", "random codes"),
@@ -312,25 +272,18 @@ _OF_VIEWS = {n: f"{n} view{'s' if n > 1 else ''}" for n in _PAPER_VIEWS}
 VIEWS = Table(
     title="How much does each further image lower the error?",
     rows=tuple(
-        Row(name=_OF_VIEWS[n], views=n, paper={"cd": cd, "fps_cd": fps})
+        Row(_OF_VIEWS[n], views=n, paper={"cd": cd, "fps_cd": fps})
         for n, (cd, fps) in _PAPER_VIEWS.items()
     ),
     claims=(
         *(below("cd", _OF_VIEWS[n + 1], _OF_VIEWS[n]) for n in range(1, 8)),
-        Claim(
-            "CD falls most from 1 view to 2",
-            lambda r: r["1 view"]["cd"] - r["2 views"]["cd"] - (r["2 views"]["cd"] - r["3 views"]["cd"]),
-        ),
-        Claim(
+        falls_more("CD falls most from 1 view to 2", "cd", ("1 view", "2 views"), ("2 views", "3 views")),
+        falls_more(
             "FPS-CD falls more from 1 view to 2 than from 4 to 8",
-            lambda r: (
-                r["1 view"]["fps_cd"]
-                - r["2 views"]["fps_cd"]
-                - (r["4 views"]["fps_cd"] - r["8 views"]["fps_cd"])
-            ),
+            "fps_cd", ("1 view", "2 views"), ("4 views", "8 views"),
         ),
     ),
-)
+)  # fmt: skip
 
 TABLES = {
     "diversity": DIVERSITY, "single-category": SINGLE_CATEGORY, "multi-category": MULTI_CATEGORY,

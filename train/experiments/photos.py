@@ -25,8 +25,9 @@ from train.data.render import orbit_camera
 from train.errors import UserError
 from train.evaluation.inference import reconstruct
 from train.evaluation.reconstruct import MOST_IMAGES, read_pictures
-from train.experiments.frame import Experiment, Outcome
-from train.experiments.statistics import spread, trainings
+from train.experiments.coverage import predict
+from train.experiments.frame import Experiment, Outcome, markdown_page
+from train.experiments.statistics import spread, stacked, trainings
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
 from train.show import figures
@@ -49,39 +50,36 @@ class PhotographedObject(NamedTuple):
     pictures: Tensor
 
 
-def _files(study: Study) -> list[Path]:
-    """All files of the folder of photographs."""
-    return sorted(path for path in study.pictures.rglob("*") if path.is_file()) if study.pictures else []
-
-
 def make(study: Study) -> Outcome:
     """For each object of `study.pictures` the consistency loss x100 (mean chamfer distance of the pairs of its
     pictures' predictions) after each of `_STEPS`; None for an object with a single picture, which has no pairs."""
     objects, left_out = read_objects(study.pictures)  # before hours of training
     configs = study.configs(unchanged)
     study.train_all(configs)
-    by_seed = [[_reconstruct(study, config, each) for each in objects] for config in configs]
-    result = study.about(configs[0]) | {
-        "pictures": str(study.pictures),
-        "objects": {
-            each.name: {"pictures": len(each.pictures), **_losses([found[number] for found in by_seed])}
-            for number, each in enumerate(objects)
-        },
-        "left_out": left_out,
-    }
-    return Outcome(result, markdown(result), {"": _figure(result, objects, by_seed[0])})
+    found = [[_reconstruct(study, config, each) for config in configs] for each in objects]
+    losses = [stacked(by_seed)["losses"] for by_seed in found]  # of each object (S, 3)
+    by_object: dict[str, dict[str, Any]] = {each.name: {"pictures": len(each.pictures)} for each in objects}
+    for of_object, loss in zip(by_object.values(), losses, strict=True):
+        for step, values in zip(_STEPS, loss.T, strict=True):
+            of_object[step] = None if np.isnan(values).any() else spread(values)
+    about = {"pictures": str(study.pictures), "objects": by_object, "left_out": left_out}
+    result = study.about(configs[0]) | about
+    first = [by_seed[0] for by_seed in found]
+    return Outcome(result, markdown(result), {"": _figure(result, objects, first)})
 
 
-photos = Experiment(make, lambda study: study.configs(unchanged), _files)
+photos = Experiment(
+    make,
+    lambda study: study.configs(unchanged),
+    lambda study: sorted(filter(Path.is_file, study.pictures.rglob("*"))) if study.pictures else [],
+)
 
 
 def read_objects(folder: Path | None) -> tuple[list[PhotographedObject], dict[str, str]]:
     """The first objects of a folder of photographs, and what was left out, with the reason.
 
-    A cut-out is taken as it is; another picture is cut out by its mask, if it has one, or from its plain background.
-
-    Args:
-        folder: as `data photos` takes or writes it: a folder of pictures for each object, or one object's.
+    The folder is one that `data photos` takes or writes, with a folder of pictures for each object, or one object's. A
+    cut-out is taken as it is; another picture is cut out by its mask, if it has one, or from its plain background.
 
     Raises:
         UserError: no folder, or not a single picture that can be used.
@@ -128,9 +126,7 @@ def _reconstruct(study: Study, config: FitConfig, found: PhotographedObject) -> 
 
     def measure() -> Metrics:
         model = study.network(config)
-        codes = torch.randn(CODES, 1, model.code_dim, generator=torch.Generator().manual_seed(config.seed))
-        with torch.no_grad():
-            one = model(found.pictures[:1], codes)[:, 0].contiguous()
+        one = predict(model, found.pictures[0], CODES, seed=config.seed)
         agreed = reconstruct(model, found.pictures, seed=config.seed, settings=config.inference)
         losses = torch.full((len(_STEPS),), torch.nan)
         if len(found.pictures) > 1:
@@ -142,13 +138,6 @@ def _reconstruct(study: Study, config: FitConfig, found: PhotographedObject) -> 
     pictures = hashlib.sha256(found.pictures.numpy().tobytes()).hexdigest()
     settings = dataclasses.asdict(config.inference)
     return study.kept(["photos", *study.weights_key(config), settings, CODES, pictures], measure)
-
-
-def _losses(by_seed: Sequence[Metrics]) -> dict[str, Any]:
-    values = torch.stack([each["losses"].double() for each in by_seed])
-    if values.isnan().any():
-        return dict.fromkeys(_STEPS)
-    return {step: spread(column) for step, column in zip(_STEPS, values.T, strict=True)}
 
 
 def markdown(result: Mapping[str, Any]) -> str:
@@ -163,10 +152,10 @@ def markdown(result: Mapping[str, Any]) -> str:
         [name, str(each["pictures"]), *(f"{each[step]['mean']:.2f}" if each[step] else "" for step in _STEPS)]
         for name, each in result["objects"].items()
     ]
-    lines = [head, "", *markdown_lines(["", "pictures", *_STEPS], rows), ""]
+    blocks = [head, markdown_lines(["", "pictures", *_STEPS], rows)]
     if result["left_out"]:
-        lines += ["Left out:", "", *(f"- {title}: {why}" for title, why in result["left_out"].items()), ""]
-    return "\n".join(lines)
+        blocks += ["Left out:", [f"- {title}: {why}" for title, why in result["left_out"].items()]]
+    return markdown_page(*blocks)
 
 
 def _figure(
@@ -184,20 +173,20 @@ def _figure(
             figures.draw_image(axes, picture)
         count = len(each.pictures)
         figures.caption(line[0], f"{each.name}, {count} picture{'s' if count > 1 else ''}")
-        close = figures.narrowed(sides, torch.cat([made["agreed"], made["one"].flatten(0, 1)]))
-        for axes, cloud in zip(line[shown:-2], made["one"], strict=True):
-            figures.draw_cloud(axes, cloud, close[0])
-        for axes, camera in zip(line[-2:], (close[0], close[1]), strict=True):
-            figures.draw_cloud(axes, made["agreed"], camera)
+        front, behind = figures.narrowed(sides, torch.cat([made["agreed"], made["one"].flatten(0, 1)]))
+        clouds = [
+            *((cloud, front) for cloud in made["one"]),
+            (made["agreed"], front),
+            (made["agreed"], behind),
+        ]
+        for axes, (cloud, camera) in zip(line[shown:], clouds, strict=True):
+            figures.draw_cloud(axes, cloud, camera)
         if count > 1:
             before, _, after = made["losses"].tolist()
             figures.caption(line[-2], f"disagreement {before:.2f} to {after:.2f}")
     codes = [f"from the first, code {number + 1}" for number in range(CODES)]
     figures.titles(panels, ["pictures", *[""] * (shown - 1), *codes, "from all pictures", "from behind"])
     title = f"Photographs, profile {result['profile']}, seed 0"
-    if most > 1:
-        title += (
-            "; disagreement of the pictures' predictions (chamfer x100) with random and with agreed codes"
-        )
-    figures.headline(figure, title)
+    words = "; disagreement of the pictures' predictions (chamfer x100) with random and with agreed codes"
+    figures.headline(figure, title + words if most > 1 else title)
     return figure

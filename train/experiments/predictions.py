@@ -12,11 +12,12 @@ from torch import Tensor
 
 from diffpoint import PinholeCamera, nearest, visible_points
 from models import Predictor
+from train.config import FitConfig
 from train.data import ShapeTree
 from train.data.batches import LoadedSplit
 from train.evaluation.examples import make_example, pick_shapes
 from train.evaluation.per_shape import concatenate, sample_predictions
-from train.experiments.frame import Experiment, Outcome
+from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.statistics import claim, spreads, stacked, trainings
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
@@ -36,6 +37,7 @@ def make(study: Study) -> Outcome:
     test = study.split(configs[0], "test")
     per_shape = stacked([_measured(study, config) for config in configs])
     categories = np.array(test.categories)
+    words = f"the back varies more than {LEAST_RATIO} times as much as the front"
     result = study.about(configs[0]) | {
         "shapes": len(test),
         "codes": CODES,
@@ -43,12 +45,7 @@ def make(study: Study) -> Outcome:
         "categories": {
             name: _summary(per_shape, categories == name) for name in dict.fromkeys(test.categories)
         },
-        "claims": [
-            claim(
-                f"the back varies more than {LEAST_RATIO} times as much as the front",
-                per_shape["back"] - LEAST_RATIO * per_shape["front"],
-            )
-        ],
+        "claims": [claim(words, per_shape["back"] - LEAST_RATIO * per_shape["front"])],
     }
     return Outcome(result, markdown(result), {"": _figure(study)})
 
@@ -56,7 +53,7 @@ def make(study: Study) -> Outcome:
 predictions = Experiment(make, lambda study: study.configs(unchanged))
 
 
-def _measured(study: Study, config: Any) -> Metrics:
+def _measured(study: Study, config: FitConfig) -> Metrics:
     def measure(model: Predictor, test: LoadedSplit) -> Metrics:
         found = sample_predictions(model, test, codes=CODES, seed=config.seed)
         return concatenate([variation(clouds, shown.camera) for _, shown, clouds in found])
@@ -113,27 +110,19 @@ def markdown(result: Mapping[str, Any]) -> str:
         f"nearest point of another prediction. Claim: {found['words']}; it "
         f"{found['verdict'].replace('undecided', 'is undecided')}."
     )
-    rows = [
-        [
-            name,
-            str(row["shapes"]),
-            f"{row['front']:.2f}",
-            f"{row['back']:.2f}",
-            " / ".join(f"{ratio:.2f}" for ratio in row["ratio_by_seed"]),
-            f"{row['ratio_surface']:.2f}",
-        ]
-        for name, row in {"all": result["all"], **result["categories"]}.items()
-    ]
+    rows = []
+    for name, row in {"all": result["all"], **result["categories"]}.items():
+        ratios = " / ".join(f"{ratio:.2f}" for ratio in row["ratio_by_seed"])
+        front, back, of_surface = (f"{row[column]:.2f}" for column in ("front", "back", "ratio_surface"))
+        rows.append([name, str(row["shapes"]), front, back, ratios, of_surface])
     columns = ["", "shapes", "front", "back", "back / front, by seed", "of the surface"]
-    return "\n".join([head, "", *markdown_lines(columns, rows), ""])
+    return markdown_page(head, markdown_lines(columns, rows))
 
 
 def _figure(study: Study) -> Figure:
     config = study.config(unchanged, seed=0)
     tree = ShapeTree(study.test_tree, "test", list(config.categories) or None)
     model = study.network(config)
-    examples = [
-        make_example(model, shape, config, seed=0, codes=SHOWN_CODES)
-        for shape in pick_shapes(tree, SHOWN_SHAPES)
-    ]
+    shapes = pick_shapes(tree, SHOWN_SHAPES)
+    examples = (make_example(model, shape, config, seed=0, codes=SHOWN_CODES) for shape in shapes)
     return figures.predictions_figure(*examples)

@@ -17,7 +17,7 @@ from train.data.tree import read_shape
 from train.evaluation.inference import reconstruct
 from train.evaluation.metrics import cloud_errors, thin_out
 from train.evaluation.per_shape import view_order
-from train.experiments.frame import Experiment, Outcome
+from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, of_method, unchanged
 from train.show import figures
@@ -49,30 +49,28 @@ def make(study: Study) -> Outcome:
     Ours agrees on all images' codes, 3D-R2N2 reads the same images, PSGN gets the first of them.
     """
     study.train_all(configs(study))
-    ours = configs(study)[0]
+    ours = study.config(unchanged, seed=SEED)
     test = study.split(ours, "test")
     chosen = by_turns(test.categories, SHAPES)
     views = view_order(test, SEED)[chosen, :VIEWS]
+    given = {name: views if which == "all" else views[:, :1] for name, (_, which) in _METHODS.items()}
     found = {
-        name: _reconstruct(study, config, chosen, views if given == "all" else views[:, :1])
-        for config, (name, (_, given)) in zip(configs(study), _METHODS.items(), strict=True)
+        name: _reconstruct(study, config, chosen, given[name])
+        for name, config in zip(_METHODS, configs(study), strict=True)
     }
     errors = {
-        name: [{key: metrics[key][row].item() for key in ("cd", "fps_cd")} for row in range(len(chosen))]
-        for name, metrics in found.items()
+        name: pd.DataFrame({key: m[key].double() for key in ("cd", "fps_cd")}) for name, m in found.items()
     }
     result = study.about(ours) | {
         "seed": SEED,
         "views": views.shape[1],
-        "views_of": {name: views.shape[1] if given == "all" else 1 for name, (_, given) in _METHODS.items()},
+        "views_of": {name: each.shape[1] for name, each in given.items()},
         "shapes": {
-            test.ids[shape]: {
-                "category": test.categories[shape],
-                **{name: e[row] for name, e in errors.items()},
-            }
+            test.ids[shape]: {"category": test.categories[shape]}
+            | {name: each.loc[row].to_dict() for name, each in errors.items()}
             for row, shape in enumerate(chosen.tolist())
         },
-        "mean": {name: pd.DataFrame(each).mean().to_dict() for name, each in errors.items()},
+        "mean": {name: each.mean().to_dict() for name, each in errors.items()},
     }
     clouds = {name: metrics["points"] for name, metrics in found.items()}
     return Outcome(result, markdown(result), {"": _figure(study, result, test.points[chosen], clouds, views)})
@@ -123,7 +121,7 @@ def markdown(result: Mapping[str, Any]) -> str:
 
     rows = [[f"{each['category']} `{shape}`", *cells(each)] for shape, each in result["shapes"].items()]
     rows.append(["mean", *cells(result["mean"])])
-    return "\n".join([head, "", *markdown_lines(["", *names], rows), ""])
+    return markdown_page(head, markdown_lines(["", *names], rows))
 
 
 def _figure(

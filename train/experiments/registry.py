@@ -3,65 +3,40 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from train.experiments.frame import Experiment
 
-
-class Entry(NamedTuple):
-    """A description in a line, and where the experiment is: "module:name", relative to train.experiments."""
-
-    description: str
-    where: str
-
-
 EXPERIMENTS = {
-    "diversity": Entry(
-        "diversity of ten predictions for one image, by training loss (the paper's table 1)",
-        "paper:diversity",
-    ),
-    "single-category": Entry(
-        "five methods on the shapes of one --category, eight views", "paper:single_category"
-    ),
-    "multi-category": Entry(
-        "one network for all categories: ours, PSGN and 3D-R2N2, by category", "paper:multi_category"
-    ),
-    "deterministic": Entry("our method with and without latent codes", "paper:deterministic"),
-    "ablation": Entry("effect of stage 1, stage 2, its diversity loss, search and descent", "paper:ablation"),
-    "consistency": Entry("search and descent on the highly diverse model", "paper:consistency"),
-    "correlation": Entry(
-        "correlation of consistency loss and error, over shapes and over groups of codes",
-        "correlation:correlation",
-    ),
-    "views": Entry("error for 1 to 8 images", "paper:views"),
-    "runtime": Entry("time of view-based sampling, and share of hidden points it selects", "runtime:runtime"),
-    "predictions": Entry(
-        "do predictions with different codes differ more behind than in front?", "predictions:predictions"
-    ),
-    "reconstructions": Entry(
-        "figure: reconstructions from eight views, three methods", "reconstructions:reconstructions"
-    ),
-    "one-armed": Entry(
-        "does the deterministic network invent the hidden arm rest of a chair, and does ours avoid it with two views?",
-        "one_armed:one_armed",
-    ),
-    "coverage": Entry(
-        "do predictions reach all backs that a front can have, and are any unlike all of them?",
-        "coverage:coverage",
-    ),
-    "critic": Entry("training with and without the latent critic", "critic:critic"),
-    "agreement": Entry(
-        "search and descent in detail: step sizes, steps, groups, regularisation", "agreement:agreement"
-    ),
-    "collapse": Entry("which design choices prevent predictions that ignore the image", "collapse:collapse"),
-    "front-vs-projection": Entry(
-        "front constraint against projection losses, on free point clouds and in networks",
-        "front_vs_projection.experiment:front_vs_projection",
-    ),
-    "photos": Entry("figure: reconstructions of your own photographs (--pictures)", "photos:photos"),
+    "diversity": "diversity of ten predictions for one image, by training loss (the paper's table 1)",
+    "single-category": "five methods on the shapes of one --category, eight views",
+    "multi-category": "one network for all categories: ours, PSGN and 3D-R2N2, by category",
+    "deterministic": "our method with and without latent codes",
+    "ablation": "effect of stage 1, stage 2, its diversity loss, search and descent",
+    "consistency": "search and descent on the highly diverse model",
+    "correlation": "correlation of consistency loss and error, over shapes and over groups of codes",
+    "views": "error for 1 to 8 images",
+    "runtime": "time of view-based sampling, and share of hidden points it selects",
+    "predictions": "do predictions with different codes differ more behind than in front?",
+    "reconstructions": "figure: reconstructions from eight views, three methods",
+    "one-armed": "does the deterministic network invent the hidden arm rest of a chair, and does ours avoid it with "
+    "two views?",
+    "coverage": "do predictions reach all backs that a front can have, and are any unlike all of them?",
+    "critic": "training with and without the latent critic",
+    "agreement": "search and descent in detail: step sizes, steps, groups, regularisation",
+    "collapse": "which design choices prevent predictions that ignore the image",
+    "front-vs-projection": "front constraint against projection losses, on free point clouds and in networks",
+    "photos": "figure: reconstructions of your own photographs (--pictures)",
 }
-"""Name -> entry, in the order in which `all` makes them."""
+"""Name -> description, in the order in which `all` makes them."""
+
+_MODULES = {
+    **dict.fromkeys(("diversity", "single-category", "multi-category", "deterministic"), "paper"),
+    **dict.fromkeys(("ablation", "consistency", "views"), "paper"),
+    "front-vs-projection": "front_vs_projection.experiment",
+}
+"""Where an experiment is that has no module of its own name."""
 
 FORMER_NAMES = {"health": "collapse"}
 """Names that an experiment had before -> its name; the command line accepts both."""
@@ -76,5 +51,6 @@ ABOUT_ALL = {
 
 def load(name: str) -> Experiment:
     """Imports an experiment."""
-    module, attribute = EXPERIMENTS[name].where.split(":")
-    return getattr(importlib.import_module(f"train.experiments.{module}"), attribute)
+    attribute = name.replace("-", "_")
+    module = importlib.import_module(f"train.experiments.{_MODULES.get(name, attribute)}")
+    return getattr(module, attribute)

@@ -18,14 +18,7 @@ __all__ = ["Study", "make_all", "print_status", "run_all", "run_experiment", "wr
 
 
 def run_experiment(name: str, study: Study) -> dict[str, Any]:
-    """Makes one experiment, and prints its page.
-
-    Args:
-        name: one of `registry.EXPERIMENTS`.
-        study: data, profile and seeds, and where to write.
-
-    Returns:
-        What NAME.json holds.
+    """Makes one experiment of the registry, prints its page, and returns what NAME.json holds.
 
     Raises:
         UserError: no usable data, an unknown run, or numbers out of range.
@@ -40,9 +33,8 @@ def run_experiment(name: str, study: Study) -> dict[str, Any]:
 
 def print_status(study: Study) -> None:
     """Prints which experiments are done, and how long the missing trainings will take."""
-    descriptions = {name: entry.description for name, entry in EXPERIMENTS.items()}
     found = list(status(_wanted(study), study))
-    print("\n".join(status_lines(found, descriptions, processes=study.processes)))
+    print("\n".join(status_lines(found, EXPERIMENTS, processes=study.processes)))
 
 
 def run_all(study: Study) -> None:
@@ -52,10 +44,7 @@ def run_all(study: Study) -> None:
 
 
 def make_all(experiments: Mapping[str, Experiment], study: Study) -> list[str]:
-    """Makes every experiment that is not done yet. If one cannot be made, the others still are.
-
-    Returns:
-        Names of those that were made.
+    """Makes every experiment that is not done yet, returns their names. If one cannot be made, the others still are.
 
     Raises:
         UserError: some could not be made; raised at the end, with all reasons.

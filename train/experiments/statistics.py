@@ -17,8 +17,7 @@ LEVEL = 0.95
 """Of all intervals."""
 _RESAMPLES = 4000
 
-Verdict = Literal["holds", "undecided", "does not hold"]
-VERDICTS: tuple[Verdict, ...] = ("holds", "does not hold", "undecided")
+Verdict = Literal["holds", "does not hold", "undecided"]
 CLAIM_COLUMNS = ("claim", f"gain [{LEVEL:.0%} interval]", "gain in the paper", "verdict")
 CLAIM_ALIGNMENT = "lrrl"
 
@@ -43,6 +42,16 @@ def spread(by_seed: Sequence[float] | np.ndarray | Tensor) -> dict[str, Any]:
 def spreads(metrics: Mapping[str, np.ndarray], shapes: Any = slice(None)) -> dict[str, dict[str, Any]]:
     """`spread` of the means over (some) shapes of every metric (S, M)."""
     return {name: spread(values[:, shapes].mean(1)) for name, values in metrics.items()}
+
+
+def transposed(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Row -> column -> value as column -> row -> value.
+
+    Example:
+        >>> transposed({"cd": {"mean": 1.0, "sd": 0.1}})
+        {'mean': {'cd': 1.0}, 'sd': {'cd': 0.1}}
+    """
+    return {column: {name: row[column] for name, row in rows.items()} for column in next(iter(rows.values()))}
 
 
 def spread_text(found: Mapping[str, Any]) -> str:
@@ -141,9 +150,10 @@ def counted(claims: Iterable[Mapping[str, Any]]) -> str:
         '2 claims are tested: 1 holds, 0 do not hold, 1 is undecided.'
     """
     counts = Counter(found["verdict"] for found in claims)
-    one, several = ("holds", "does not hold", "is undecided"), ("hold", "do not hold", "are undecided")
-    parts = [
-        f"{counts[name]} {(one if counts[name] == 1 else several)[number]}"
-        for number, name in enumerate(VERDICTS)
-    ]
+    words = {
+        "holds": ("holds", "hold"),
+        "does not hold": ("does not hold", "do not hold"),
+        "undecided": ("is undecided", "are undecided"),
+    }
+    parts = [f"{counts[name]} {words[name][counts[name] != 1]}" for name in words]
     return f"{counts.total()} claims are tested: {', '.join(parts)}."

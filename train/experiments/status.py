@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from train.config import FitConfig, fit_config_from_json
 from train.errors import UserError
 from train.experiments.frame import Experiment, is_done
-from train.experiments.study import Study, parts_of
+from train.experiments.study import Study, after_stage1, parts_of
 
 # Processor time of a step of the cpu profile on one core of an Intel Xeon of 2024; used until a run of the kind was
 # timed.
@@ -21,52 +21,44 @@ _SECONDS_PER_STEP = {
 
 
 class Status(NamedTuple):
-    """The status of an experiment.
-
-    Attributes:
-        name: the experiment's.
-        done: its result is there, made from just this study.
-        trained: how many of its runs are finished.
-        runs: how many it needs; experiments may share them.
-        seconds: what the missing ones will take on one core; None if no run of their kind was timed yet.
-        all_seconds: what all of them take, finished ones as they were timed; None as before.
-    """
+    """The status of an experiment."""
 
     name: str
     done: bool
+    """Its result is there, made from just this study."""
     trained: int
+    """How many of its trainings are finished."""
     runs: int
+    """How many it needs; experiments may share them."""
     seconds: float | None
+    """What the missing ones will take on one core; None if no run of their kind was timed yet."""
     all_seconds: float | None
+    """What all of them take, finished ones as they were timed; None as before."""
 
 
 def status(experiments: Mapping[str, Experiment], study: Study) -> Iterator[Status]:
-    """The status of each experiment; a run that several need counts for the first."""
+    """The status of each experiment; a training that several need counts for the first."""
     trees = need_trees(study)
     timed, counted = _timed(study), set[Path]()
-    speeds = _speeds(timed)
+    speeds = {_kind(config): seconds / _steps(config) for config, seconds in timed.values()}
     for name, experiment in experiments.items():
-        parts = {
-            trees.run_of(part): (part, number > 0)
+        needed = {
+            trees.run_of(part) / "trained.json": after_stage1(part) if number else part
             for config in experiment.trainings(trees)
             for number, part in enumerate(parts_of(config))
-        }
+        } | experiment.own_trainings(trees)
         costs = {
-            run: timed[run] if run in timed else _seconds(*part, speeds)
-            for run, part in parts.items()
-            if run not in counted
+            path: timed[path][1] if path in timed else _seconds(part, speeds)
+            for path, part in needed.items()
+            if path not in counted
         }
-        missing = {run for run, (part, _) in parts.items() if not trees.is_trained(part)}
-        counted |= set(parts)
-        own = experiment.own_trainings(trees)
-        costs |= {path: _seconds(config, False, speeds) for path, config in own.items()}
-        missing |= {path for path in own if not path.exists()}
-        runs = len(parts) + len(own)
+        missing = {path for path in needed if not path.exists()}
+        counted |= needed.keys()
         yield Status(
             name,
             is_done(name, experiment, study),
-            trained=runs - len(missing),
-            runs=runs,
+            trained=len(needed) - len(missing),
+            runs=len(needed),
             seconds=_sum(costs[path] for path in missing & costs.keys()),
             all_seconds=_sum(costs.values()),
         )
@@ -113,36 +105,29 @@ def _sum(costs: Iterable[float | None]) -> float | None:
     return None if None in values else float(sum(value or 0.0 for value in values))
 
 
-Kind = tuple[str, str, bool, bool]
-"""Steps of runs of one kind take the same time: profile, method, deterministic, stage 2."""
+def _kind(config: FitConfig) -> tuple[str, str, bool, bool]:
+    """Steps of trainings of one kind take the same time."""
+    return config.profile, config.system, config.deterministic, "stage1" in config.phases
 
 
-def _kind(config: FitConfig, *, second: bool) -> Kind:
-    return config.profile, config.system, config.deterministic, second
+def _steps(config: FitConfig) -> int:
+    return sum(phase.steps for phase in config.phases.values())
 
 
-def _timed(study: Study) -> dict[Path, float]:
-    """Processor seconds of the runs that were trained without an interruption, the newest last."""
-    notes = sorted((study.out / "runs").glob("*/trained.json"), key=lambda path: path.stat().st_mtime)
-    took = {note.parent: json.loads(note.read_text()) for note in notes}
-    return {run: each["seconds"] for run, each in took.items() if not each["continued"]}
-
-
-def _speeds(timed: Mapping[Path, float]) -> dict[Kind, float]:
-    """Processor seconds per step, of the newest run of each kind."""
-    found: dict[Kind, float] = {}
-    for run, seconds in timed.items():
-        config = fit_config_from_json((run / "config.json").read_text(), where=str(run))
-        steps = sum(phase.steps for phase in config.phases.values())
-        found[_kind(config, second="stage1" not in config.phases)] = seconds / steps
+def _timed(study: Study) -> dict[Path, tuple[FitConfig, float]]:
+    """trained.json of each run that was trained without an interruption -> its configuration and processor seconds, the
+    newest last."""
+    found = {}
+    for note in sorted((study.out / "runs").glob("*/trained.json"), key=lambda path: path.stat().st_mtime):
+        took, saved = json.loads(note.read_text()), note.with_name("config.json")
+        if not took["continued"]:
+            found[note] = fit_config_from_json(saved.read_text(), where=str(saved)), took["seconds"]
     return found
 
 
-def _seconds(part: FitConfig, second: bool, speeds: Mapping[Kind, float]) -> float | None:
-    """What a run will take: the first of `parts_of`, or the second, which trains stage 2 alone."""
-    alone = second or "stage1" not in part.phases
-    steps = part.stage2.steps if second else sum(phase.steps for phase in part.phases.values())
-    known = speeds.get(_kind(part, second=alone))
-    if known is None and part.profile == "cpu":
-        known = _SECONDS_PER_STEP["deterministic" if part.deterministic else part.system]
-    return None if known is None else known * steps
+def _seconds(config: FitConfig, speeds: Mapping[Any, float]) -> float | None:
+    """Processor seconds that a training will take."""
+    speed = speeds.get(_kind(config))
+    if speed is None and config.profile == "cpu":
+        speed = _SECONDS_PER_STEP["deterministic" if config.deterministic else config.system]
+    return None if speed is None else speed * _steps(config)

@@ -35,33 +35,23 @@ def digest(value: object) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def read(out: Path, key: Sequence[object]) -> Metrics | None:
-    """The metrics that are kept under a key in a directory of experiments; None if there are none."""
+def kept(out: Path, key: Sequence[object], measure: Callable[[], Metrics] | None) -> Metrics:
+    """The metrics under a key (plain JSON values: everything that they depend on), measured now if they are not kept.
+
+    Raises:
+        NotMeasured: they are not kept, and `measure` is None: nothing may be measured.
+    """
     name = digest(key)
     # In this order: `pack` writes the packed file before it removes the single ones.
     try:
         return load_file(_single(out, name))
     except FileNotFoundError:
-        return _packed(out).get(name)
-
-
-def kept(out: Path, key: Sequence[object], measure: Callable[[], Metrics] | None) -> Metrics:
-    """The metrics under a key: read if they are kept, else measured now and kept.
-
-    Args:
-        out: directory of experiments.
-        key: plain JSON values: everything that the metrics depend on.
-        measure: makes them; None where nothing may be measured.
-
-    Raises:
-        NotMeasured: they are not kept, and nothing may be measured.
-    """
-    found = read(out, key)
+        found = _packed(out).get(name)
     if found is None:
         if measure is None:
-            raise NotMeasured(digest(key))
+            raise NotMeasured(name)
         found = measure()
-        with replacing(_single(out, digest(key))) as temporary:
+        with replacing(_single(out, name)) as temporary:
             temporary.write_bytes(save(found, metadata={"key": json.dumps(key, sort_keys=True)}))
     return found
 
@@ -82,9 +72,7 @@ def pack(out: Path) -> None:
     for path in singles:
         measured[path.stem] = load_file(path)
         described[path.stem] = json.loads(_metadata(path)["key"])
-    flat = {
-        f"{name}/{metric}": measured[name][metric] for name in sorted(measured) for metric in measured[name]
-    }
+    flat = {f"{name}/{metric}": each for name in sorted(measured) for metric, each in measured[name].items()}
     with replacing(target) as temporary:
         metadata = {name: json.dumps(key, sort_keys=True) for name, key in described.items()}
         temporary.write_bytes(save(flat, metadata=metadata))

@@ -41,59 +41,49 @@ Change = Callable[[FitConfig], FitConfig]
 
 # Fields that do not change the weights. The seed has a place of its own in the name of a run.
 _NOT_OF_THE_WEIGHTS = (
-    "inference",
-    "seed",
-    "log_every",
-    "picture_every",
-    "checkpoint_every",
-    "keep_checkpoints",
-)
+    "inference", "seed", "log_every", "picture_every", "checkpoint_every", "keep_checkpoints",
+)  # fmt: skip
 # The error of a method on its training shapes is measured on so many of them.
 _SOME_TRAINING_SHAPES = 100
 
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """Data, a profile and seeds; and a directory for what is trained and measured with them.
-
-    Attributes:
-        data: roots of data trees, put together for training; the test split of the first is used for measurements.
-        out: directory for runs, metrics and results.
-        profile: size of the networks and recipe of their training.
-        seeds: number of trainings of each variant, with seeds 0, 1, ...
-        limit: measure at most that many test shapes.
-        steps: if given, the same number of steps for every phase, for a quick look.
-        progress: show progress bars.
-        processes: how many trainings or measurements run at the same time, each in a process with one thread.
-        category: for single-category, the category that it is about.
-        pictures: for photos, a folder with a folder of photographs for each object.
-        run: for agreement, a trained run, as `train.evaluation.runs.open_run` takes it; trained here if not given.
-        views: for agreement, views per shape.
-        measures: False: `NotMeasured` is raised instead of measuring anything.
-    """
+    """Data, a profile and seeds; and a directory for what is trained and measured with them."""
 
     data: tuple[Path, ...]
+    """Roots of data trees, put together for training; the test split of the first is used for measurements."""
     out: Path
+    """Directory for runs, metrics and results."""
     profile: Profile = "cpu"
+    """Size of the networks and recipe of their training."""
     seeds: int = 3
+    """Number of trainings of each variant, with seeds 0, 1, ..."""
     limit: int | None = None
+    """Measure at most that many test shapes."""
     steps: int | None = None
+    """If given, the same number of steps for every phase, for a quick look."""
     progress: bool = True
+    """Show progress bars."""
     processes: int = 1
+    """How many trainings or measurements run at the same time, each in a process with one thread."""
     category: str = "chair"
+    """For single-category, the category that it is about."""
     pictures: Path | None = None
+    """For photos, a folder with a folder of photographs for each object."""
     run: Path | None = None
+    """For agreement, a trained run, as `train.evaluation.runs.open_run` takes it; trained here if not given."""
     views: int = 8
+    """For agreement, views per shape."""
     measures: bool = True
+    """False: `NotMeasured` is raised instead of measuring anything."""
     _splits: dict[tuple, LoadedSplit] = dataclasses.field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if self.seeds < 1:
-            raise UserError(f"--seeds must be at least 1; got {self.seeds}")
-        if self.limit is not None and self.limit < 2:
-            raise UserError(f"--limit must be at least 2, for a spread over shapes; got {self.limit}")
-        if self.processes < 1:
-            raise UserError(f"--processes must be at least 1; got {self.processes}")
+        for name, least in (("seeds", 1), ("limit", 2), ("processes", 1)):  # 2 shapes, for a spread over them
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise UserError(f"--{name} must be at least {least}; got {value}")
 
     # Configurations and data
 
@@ -108,9 +98,8 @@ class Study:
 
     def on_trees(self) -> Study:
         """The same with only those of its data that are data trees, on which networks can be trained."""
-        return dataclasses.replace(
-            self, data=tuple(root for root in self.data if (root / "data_list").is_dir())
-        )
+        trees = tuple(root for root in self.data if (root / "data_list").is_dir())
+        return dataclasses.replace(self, data=trees)
 
     def need_data(self) -> None:
         """Raises a UserError if there are no data."""
@@ -129,13 +118,8 @@ class Study:
         return [_tree_fingerprint(root) for root in self.data]
 
     def split(self, config: FitConfig, split: Split, *, limit: int | None = None) -> LoadedSplit:
-        """A split of the first tree as a configuration's network reads it; read once.
-
-        Args:
-            config: decides the sizes of images and maps, and the categories.
-            split: which one.
-            limit: at most so many shapes; if not given, all training shapes, or `self.limit` of the others.
-        """
+        """A split of the first tree as a configuration's network reads it; read once. Without a limit, all training
+        shapes, or `self.limit` of the others."""
         size = get_method(config.system).image_size(config)
         limit = limit or (self.limit if split != "train" else None)
         key = (self.test_tree, limit, split, *size, config.map_size, config.gt_pool, config.categories)
@@ -178,8 +162,7 @@ class Study:
         if self.is_trained(config):
             return run
         if start is not None:
-            stage1 = dataclasses.replace(config.stage1, steps=0)
-            config = dataclasses.replace(config, stage1=stage1, start=str(start))
+            config = dataclasses.replace(after_stage1(config), start=str(start))
         saved = run / "config.json"
         begun = saved.exists()
         if begun:
@@ -191,29 +174,20 @@ class Study:
         write_text(run / "trained.json", json.dumps({"seconds": seconds, "continued": begun}) + "\n")
         return run
 
-    def missing_runs(self, configs: Sequence[FitConfig]) -> tuple[list[FitConfig], list[FitConfig]]:
-        """The runs that trainings still need, each once: those from fresh weights, and those that start from them."""
-        rounds: tuple[dict[Path, FitConfig], dict[Path, FitConfig]] = ({}, {})
-        for config in configs:
-            for found, part in zip(rounds, parts_of(config), strict=False):
-                if not self.is_trained(part):
-                    found.setdefault(self.run_of(part), part)
-        return list(rounds[0].values()), list(rounds[1].values())
-
     def train_all(self, configs: Sequence[FitConfig]) -> None:
         """Trains what is not trained yet, `processes` at once; the weights do not depend on how many.
 
-        Raises:
-            KeyboardInterrupt: as `train`.
-            UserError: one could not be trained; those that ran at the same time have been finished.
+        If one cannot be trained, those that run at the same time are finished; see `train` for interruptions.
         """
-        for missing in self.missing_runs(configs):
-            self.side_by_side(Study.train, [(config,) for config in missing], title="trainings")
+        for number in (0, 1):  # first the runs from fresh weights, then those that start from them
+            parts = [part for config in configs for part in parts_of(config)[number : number + 1]]
+            missing = {self.run_of(part): part for part in parts if not self.is_trained(part)}.values()
+            self.side_by_side(Study.train, [(part,) for part in missing], title="trainings")
             threads = torch.get_num_threads()
             torch.set_num_threads(1)
             try:
-                for config in missing:
-                    self.train(config)
+                for part in missing:
+                    self.train(part)
             finally:
                 torch.set_num_threads(threads)
 
@@ -226,10 +200,13 @@ class Study:
             torch.manual_seed(config.seed)
             return get_method(config.system).build(config)
         run = self.train(config, stage=stage)
-        has_stage = f"stage{stage}" in config.phases
-        return load_predictor(best_weights(run, stage) if has_stage else run)
+        return load_predictor(best_weights(run, stage) if f"stage{stage}" in config.phases else run)
 
     # Measurements
+
+    def weights_key(self, config: FitConfig) -> list[Any]:
+        """The part of a measurement's key that names a configuration's weights."""
+        return [self.run_key(config), config.seed]
 
     def kept(self, key: Sequence[object], measure: Callable[[], Metrics]) -> Metrics:
         """The metrics under a key of plain JSON values, measured now if they are not kept; see `store.kept`."""
@@ -248,8 +225,8 @@ class Study:
 
         Args:
             config: whose network.
-            what: names the measurement, with everything that decides its outcome; plain JSON values.
-            function: makes it.
+            what: everything else that decides the outcome, as plain JSON values.
+            function: makes the measurement.
             stage: see `network`.
             split: of the first tree; of the training shapes a hundred, evenly spread.
         """
@@ -257,10 +234,6 @@ class Study:
         run = self.weights_key(stage1_of(config) if stage == 1 else config)
         key = [*run, stage, what, split, data.fingerprint]
         return self.kept(key, lambda: function(self.network(config, stage=stage), data))
-
-    def weights_key(self, config: FitConfig) -> list[Any]:
-        """The part of a measurement's key that names a configuration's weights."""
-        return [self.run_key(config), config.seed]
 
     def reconstruction_metrics(
         self,
@@ -274,36 +247,20 @@ class Study:
     ) -> Metrics:
         """Errors (M,) of what a configuration's network reconstructs from several views of each shape.
 
-        Args:
-            config: whose network; its seed draws views and codes.
-            settings: how the codes are chosen.
-            stage: of the weights.
-            views: per shape.
-            split: of the first tree.
-            code_seed: draws the codes in place of the configuration's seed.
+        The configuration's seed draws the views, and the codes if there is no `code_seed`.
         """
+
+        def evaluate(model: Predictor, data: LoadedSplit) -> Metrics:
+            return evaluate_split(model, data, settings, views=views, seed=config.seed, code_seed=code_seed)
+
         what = [dataclasses.asdict(settings), views, *([] if code_seed is None else [code_seed])]
-        return self.measure(
-            config,
-            what,
-            lambda model, data: evaluate_split(
-                model, data, settings, views=views, seed=config.seed, code_seed=code_seed
-            ),
-            stage=stage,
-            split=split,
-        )
+        return self.measure(config, what, evaluate, stage=stage, split=split)
 
     def retrieval_metrics(
         self, baseline: Literal["medoid", "nearest image"], config: FitConfig, *, views: int
     ) -> Metrics:
-        """Errors (M,) of a retrieval baseline on the data that a configuration reads.
-
-        Args:
-            baseline: the medoid of the training shapes, or for each test shape the training shape with the nearest
-                image.
-            config: decides the sizes of images and clouds.
-            views: from which images are retrieved.
-        """
+        """Errors (M,) of the medoid of the training shapes, or for each test shape of the training shape with the
+        nearest image; with a configuration's sizes of images and clouds."""
         test, train = self.split(config, "test"), self.split(config, "train")
         points = get_method(config.system).cloud_size(config)
 
@@ -314,19 +271,14 @@ class Study:
                 clouds = train.points[nearest_by_image(test, train, views=(views,))[views]]
             parts = zip(clouds.split(SHAPES_AT_ONCE), test.points.split(SHAPES_AT_ONCE), strict=True)
             return concatenate(
-                [compare_clouds(cloud.contiguous(), true, points=points) for cloud, true in parts]
+                [compare_clouds(each.contiguous(), true, points=points) for each, true in parts]
             )
 
         size = get_method(config.system).image_size(config)
-        key = [baseline, points, size, views, train.fingerprint, test.fingerprint]
-        return self.kept(key, measure)
+        return self.kept([baseline, points, size, views, train.fingerprint, test.fingerprint], measure)
 
-    def is_kept(self, function: Callable[[Study], object]) -> bool:
-        """Are all metrics kept that a function takes from a study? Then it needs no network."""
-        return self._missing(function) is None
-
-    def _missing(self, function: Callable[[Study], object]) -> str | None:
-        """KEY of the first metrics that a function would have to measure."""
+    def first_missing(self, function: Callable[[Study], object]) -> str | None:
+        """KEY of the first metrics that a function would have to measure; None if all are kept."""
         try:
             function(dataclasses.replace(self, measures=False))
         except NotMeasured as key:
@@ -334,42 +286,34 @@ class Study:
         return None
 
     def measure_all(self, function: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
-        """Takes those of several measurements that are not kept, `processes` at once; one process leaves them for
-        later.
+        """Calls `function(study, *each)` for those arguments whose metrics are not kept; see `side_by_side`.
 
-        Args:
-            function: called with a study and each of the arguments; importable by name. Its result is dropped, the
-                metrics that it keeps stay.
-            arguments: can be pickled; the networks that they need are trained.
-
-        Raises:
-            KeyboardInterrupt: a signal ended it early; finished measurements are kept.
+        The networks that they need must be trained. After a signal (KeyboardInterrupt), finished measurements are kept.
         """
         if self.processes == 1:  # nothing is saved by looking for what is missing
             return
-        missing: dict[str, tuple[Any, ...]] = {}
-        for given in arguments:
-            key = self._missing(lambda study, given=given: function(study, *given))
-            if key is not None:
-                missing.setdefault(key, given)
+        missing = {
+            self.first_missing(lambda study, given=given: function(study, *given)): given
+            for given in arguments
+        }
+        missing.pop(None, None)
         self.side_by_side(function, list(missing.values()), title="measurements")
 
     def side_by_side(self, function: Callable[..., object], calls: Sequence[tuple], *, title: str) -> None:
-        """Calls a function with a quiet study of one process and each of several arguments, `processes` at once.
+        """Calls `function(study, *each)`, `processes` at once; results are dropped, what is kept on disk stays.
 
-        One process, or a single call, does nothing: the caller makes it then. Results are dropped; what is kept on disk
-        stays.
+        With one process, or for a single call, it does nothing: the caller makes the call then.
+
+        Args:
+            function: importable by name; called with a quiet study of one process.
+            calls: the further arguments of each call, which can be pickled.
+            title: of the progress bar.
         """
         if min(self.processes, len(calls)) < 2:
             return
         alone = dataclasses.replace(self, progress=False, processes=1, _splits={})
-        run_in_processes(
-            functools.partial(_call, function),
-            [(alone, *call) for call in calls],
-            processes=self.processes,
-            title=title,
-            progress=self.progress,
-        )
+        call, given = functools.partial(_call, function), [(alone, *each) for each in calls]
+        run_in_processes(call, given, processes=self.processes, title=title, progress=self.progress)
 
     def about(self, config: FitConfig) -> dict[str, Any]:
         """What every result states of its making: profile, data, seeds, and the networks' configuration."""
@@ -393,6 +337,11 @@ def of_method(name: Any) -> Change:
 
 def _recipe_like(config: FitConfig, name: str) -> FitConfig:
     return recipe(name, config.profile)
+
+
+def after_stage1(config: FitConfig) -> FitConfig:
+    """A configuration without stage 1, of which only the weights that it starts from are left."""
+    return dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, steps=0))
 
 
 def stage1_of(config: FitConfig) -> FitConfig:

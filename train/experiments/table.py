@@ -7,15 +7,25 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from train.config import FitConfig, InferenceConfig, scaled
-from train.experiments.frame import Experiment, Outcome
-from train.experiments.statistics import claim, claim_lines, spread_text, stacked, trainings
+from train.experiments.frame import Experiment, Outcome, markdown_page
+from train.experiments.statistics import (
+    claim,
+    claim_lines,
+    spread_text,
+    spreads,
+    stacked,
+    trainings,
+    transposed,
+)
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Split, Study, stage1_of, unchanged
 from train.show import figures
@@ -52,47 +62,39 @@ def reconstruction(row: Row, study: Study, config: FitConfig) -> Metrics:
     """Errors of a row's reconstructions from several images of each shape."""
     if row.source in ("medoid", "nearest image"):
         return study.retrieval_metrics(row.source, config, views=row.views)
-    settings = config.inference
-    if row.codes == "searched":
-        settings = dataclasses.replace(settings, steps=0)
-    elif row.codes == "random":
-        settings = InferenceConfig(groups=1, steps=0)
-    elif row.codes == "agreed as in the paper":
-        settings = InferenceConfig()
-    if row.scored is not None:
-        settings = dataclasses.replace(settings, scored=row.scored)
+    settings = {
+        "agreed": config.inference,
+        "agreed as in the paper": InferenceConfig(),
+        "searched": dataclasses.replace(config.inference, steps=0),
+        "random": InferenceConfig(groups=1, steps=0),
+    }[row.codes]
+    settings = dataclasses.replace(settings, scored=row.scored or settings.scored)
     return study.reconstruction_metrics(config, settings, stage=row.stage, views=row.views, split=row.split)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class Row:
-    """A method, or a baseline without training, and how it is measured.
-
-    Attributes:
-        name: as the table shows it.
-        change: how its training differs from the profile's.
-        stage: whose best weights are measured.
-        codes: "agreed": by search and descent, as the profile or as the paper has it; "searched" only; or "random".
-        views: how many.
-        scored: see `InferenceConfig`; as the method has it if None.
-        split: which shapes; a claim can compare rows of one split only.
-        source: of the clouds: a trained network, a retrieval baseline, or the ground truth (with a `measure` of its
-            own).
-        measure: takes the metrics.
-        critic_of: how the training differs from the profile's whose auto-encoder a critic uses.
-        paper: the values in the paper.
-    """
+    """A method, or a baseline without training, and how it is measured."""
 
     name: str
+    """As the table shows it."""
+    _: dataclasses.KW_ONLY
     change: Change = unchanged
+    """How its training differs from the profile's."""
     stage: Literal[1, 2] = 2
+    """Whose best weights are measured."""
     codes: Literal["agreed", "agreed as in the paper", "searched", "random"] = "agreed"
+    """"agreed": by search and descent, as the profile or as the paper has it; "searched" only; or "random"."""
     views: int = 8
     scored: Literal["joined", "each"] | None = None
+    """See `InferenceConfig`; as the method has it if None."""
     split: Split = "test"
+    """Which shapes; a claim can compare rows of one split only."""
     source: Literal["network", "medoid", "nearest image", "truth"] = "network"
+    """Of the clouds: a trained network, a retrieval baseline, or the ground truth (with a `measure` of its own)."""
     measure: Measure = reconstruction
     critic_of: Change | None = None
+    """How the training differs from the profile's whose auto-encoder a critic uses."""
     paper: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
@@ -102,12 +104,7 @@ Rows = Mapping[str, Mapping[str, Any]]
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """What the paper's table shows.
-
-    Attributes:
-        words: what is claimed.
-        gain: of the rows' values; above 0 where the claim holds.
-    """
+    """What the paper's table shows, in words and as a gain of the rows' values: above 0 where the claim holds."""
 
     words: str
     gain: Callable[[Rows], Any]
@@ -127,25 +124,36 @@ def below(metric: str, lower: str, higher: str, *, times: float = 1.0) -> Claim:
     )
 
 
+def rising(metric: str, *names: str) -> list[Claim]:
+    """The claims that a metric is lower in each row than in the next."""
+    return [below(metric, lower, higher) for lower, higher in itertools.pairwise(names)]
+
+
+def falls_more(words: str, metric: str, first: tuple[str, str], second: tuple[str, str]) -> Claim:
+    """The claim that a metric falls more from one row to another than between two others."""
+
+    def fall(rows: Rows, start: str, end: str) -> Any:
+        return rows[start][metric] - rows[end][metric]
+
+    return Claim(words, lambda rows: fall(rows, *first) - fall(rows, *second))
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Table:
-    """One table.
-
-    Attributes:
-        title: what it compares, in a line.
-        rows: from top to bottom.
-        claims: what the paper's table shows.
-        category_claims: what it shows in every category; with any, the table has a line for each category.
-        columns: metrics, of `NAMES`.
-        of_one_category: train and measure on the study's category alone, at `cpu` for half as many steps.
-    """
+    """One table."""
 
     title: str
+    """What it compares, in a line."""
     rows: tuple[Row, ...]
+    """From top to bottom."""
     claims: tuple[Claim, ...] = ()
+    """What the paper's table shows."""
     category_claims: tuple[Claim, ...] = ()
+    """What it shows in every category; with any, the table has a line for each category."""
     columns: tuple[str, ...] = ("gt_to_pred", "pred_to_gt", "cd", "fps_cd")
+    """Metrics, of `NAMES`."""
     of_one_category: bool = False
+    """Train and measure on the study's category alone, at `cpu` for half as many steps."""
 
     @property
     def experiment(self) -> Experiment:
@@ -155,11 +163,10 @@ class Table:
     def config(self, row: Row, study: Study, *, seed: int) -> FitConfig:
         """How a row's method is trained."""
         config = study.config(row.change, seed=seed)
-        if not self.of_one_category:
-            return config
-        config = dataclasses.replace(config, categories=(study.category,))
-        if study.profile == "cpu" and study.steps is None:
-            return scaled(config, _CPU_STEPS_FOR_ONE_CATEGORY)
+        if self.of_one_category:
+            config = dataclasses.replace(config, categories=(study.category,))
+            if study.profile == "cpu" and study.steps is None:
+                config = scaled(config, _CPU_STEPS_FOR_ONE_CATEGORY)
         return config
 
     def cells(self, study: Study) -> Iterator[tuple[Row, FitConfig]]:
@@ -168,28 +175,17 @@ class Table:
             for row in self.rows:
                 yield row, self.config(row, study, seed=seed)
 
-    def trainings(self, study: Study) -> list[FitConfig]:
-        """Every training that the table needs, no longer than it needs it."""
-        return [training for cell in self.cells(study) for training in _trainings(*cell, study)]
-
-    def missing(self, study: Study) -> list[FitConfig]:
-        """Those of `trainings` whose metrics are not kept."""
-        return [
-            training
-            for row, config in self.cells(study)
-            if not study.is_kept(lambda s, row=row, config=config: measured(s, row, config))
-            for training in _trainings(row, config, study)
-        ]
-
-
-def _trainings(row: Row, config: FitConfig, study: Study) -> list[FitConfig]:
-    """A row's network, up to the stage that is measured, and the training whose auto-encoder its critic uses."""
-    found = []
-    if row.source == "network":
-        found.append(stage1_of(config) if row.stage == 1 else config)
-    if row.critic_of is not None:
-        found.append(study.config(row.critic_of, seed=config.seed))
-    return found
+    def trainings(self, study: Study, *, only_missing: bool = False) -> list[FitConfig]:
+        """Every training that the table needs, no longer than it needs it; or only those whose metrics are not kept."""
+        found = []
+        for row, config in self.cells(study):
+            if only_missing and not study.first_missing(functools.partial(measured, row=row, config=config)):
+                continue
+            if row.source == "network":
+                found.append(stage1_of(config) if row.stage == 1 else config)
+            if row.critic_of is not None:  # whose auto-encoder is used
+                found.append(study.config(row.critic_of, seed=config.seed))
+        return found
 
 
 def measured(study: Study, row: Row, config: FitConfig) -> Metrics:
@@ -198,84 +194,56 @@ def measured(study: Study, row: Row, config: FitConfig) -> Metrics:
 
 
 def make(table: Table, study: Study) -> Outcome:
-    """Trains and measures what is missing."""
+    """`tabulate`, with the page and the figure."""
     result = tabulate(table, study)
     return Outcome(result, markdown(result), {"": figure(result)})
 
 
 def tabulate(table: Table, study: Study) -> dict[str, Any]:
     """Trains and measures what is missing; what NAME.json is to hold."""
-    study.train_all(table.missing(study))
-    cells = list(table.cells(study))
-    study.measure_all(measured, cells)
-    by_row: dict[str, list[Metrics]] = {row.name: [] for row in table.rows}
-    for row, config in cells:
-        by_row[row.name].append(measured(study, row, config))
+    study.train_all(table.trainings(study, only_missing=True))
+    study.measure_all(measured, list(table.cells(study)))
+    by_row: dict[str, list[Metrics]] = {}
+    for row, config in table.cells(study):
+        by_row.setdefault(row.name, []).append(measured(study, row, config))
     per_shape = {name: stacked(metrics) for name, metrics in by_row.items()}
     config = table.config(table.rows[0], study, seed=0)
-    categories = study.split(config, "test").categories
-    values = long_table(per_shape)
+    categories = np.array(study.split(config, "test").categories)
     result: dict[str, Any] = study.about(config) | {
         "title": table.title,
         "category": study.category if table.of_one_category else None,
         "shapes": len(categories),
         "columns": list(table.columns),
-        "rows": {row.name: _summary(row, values.loc[row.name], table.columns) for row in table.rows},
+        "rows": {row.name: _summary(row, per_shape[row.name], table.columns) for row in table.rows},
         "claims": _verdicts(table.claims, per_shape, {row.name: row.paper for row in table.rows}),
     }
     if table.category_claims:
-        result["categories"] = _by_category(table, per_shape, values, pd.Series(categories, name="category"))
+        names = dict.fromkeys(categories.tolist())
+        result["categories"] = {name: _of_category(table, per_shape, categories == name) for name in names}
     return result
 
 
-def long_table(per_shape: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """A line for every row, training and shape, a column for every metric, of row -> metric -> (S, M).
-
-    Example:
-        >>> long_table({"ours": {"cd": [[1.0, 3.0]]}}).groupby("row")["cd"].mean().to_dict()
-        {'ours': 2.0}
-    """
-    lines = {
-        (row, seed): pd.DataFrame({name: values[seed] for name, values in metrics.items()})
-        for row, metrics in per_shape.items()
-        for seed in range(len(next(iter(metrics.values()))))
-    }
-    return pd.concat(lines).rename_axis(["row", "seed", "shape"])
-
-
-def _summary(row: Row, values: Any, columns: Sequence[str]) -> dict[str, Any]:
+def _summary(row: Row, metrics: Mapping[str, np.ndarray], columns: Sequence[str]) -> dict[str, Any]:
     """A row's means and standard deviations over trainings, and how the descent changed the consistency loss."""
-    values = values.dropna(axis=1, how="all")
-    by_seed = values[[name for name in columns if name in values]].groupby("seed").mean()
-    found: dict[str, Any] = {
-        "mean": by_seed.mean().to_dict(),
-        "sd": by_seed.std().to_dict() if len(by_seed) > 1 else dict.fromkeys(by_seed),
-        "by_seed": by_seed.to_dict("list"),
-        "paper": dict(row.paper),
-    }
-    if "searched" in values and row.codes.startswith("agreed"):
+    found = transposed(spreads({name: metrics[name] for name in columns if name in metrics}))
+    found["paper"] = dict(row.paper)
+    if "searched" in metrics and row.codes.startswith("agreed"):
+        searched, descended = metrics["searched"], metrics["consistency"]
         found["consistency"] = {
-            "searched": values["searched"].mean(),
-            "descended": values["consistency"].mean(),
-            "lowered_share": (values["consistency"] < values["searched"]).mean(),
+            "searched": float(searched.mean()),
+            "descended": float(descended.mean()),
+            "lowered_share": float((descended < searched).mean()),
         }
     return found
 
 
-def _by_category(
-    table: Table, per_shape: Mapping[str, Mapping[str, Any]], values: Any, categories: pd.Series
-) -> dict[str, Any]:
-    """Shapes, means and verdicts of each category."""
-    labelled = values[list(table.columns)].join(categories, on="shape")
-    means = labelled.groupby(["category", "row"]).mean()
-    found: dict[str, Any] = {}
-    for category in categories.unique():
-        mine = (categories == category).to_numpy()
-        part = {row: {k: v[:, mine] for k, v in metrics.items()} for row, metrics in per_shape.items()}
-        rows = {row.name: means.loc[(category, row.name)].dropna().to_dict() for row in table.rows}
-        claims = _verdicts(table.category_claims, part, {})
-        found[category] = {"shapes": int(mine.sum()), "rows": rows, "claims": claims}
-    return found
+def _of_category(table: Table, per_shape: Rows, mine: np.ndarray) -> dict[str, Any]:
+    """Number, means and verdicts of the shapes of a category."""
+    part, means = {}, {}
+    for row, metrics in per_shape.items():
+        part[row] = {name: metrics[name][:, mine] for name in table.columns if name in metrics}
+        means[row] = {name: float(values.mean()) for name, values in part[row].items()}
+    return {"shapes": int(mine.sum()), "rows": means, "claims": _verdicts(table.category_claims, part, {})}
 
 
 def _verdicts(claims: Sequence[Claim], rows: Rows, paper: Rows) -> list[dict[str, Any]]:
@@ -299,56 +267,48 @@ def markdown(result: Mapping[str, Any]) -> str:
         f"In brackets: the paper.{_ABOUT_THE_CRITIC if 'critic' in columns else ''}"
     )
     rows = [[name, *(_cell(row, column) for column in columns)] for name, row in result["rows"].items()]
-    lines = [head, "", *markdown_lines(["", *(NAMES[name] for name in columns)], rows)]
+    blocks: list[str | list[str]] = [head, markdown_lines(["", *(NAMES[name] for name in columns)], rows)]
     if "categories" in result:
-        lines += ["", *_category_lines(result)]
+        blocks += _category_blocks(result)
     if result["claims"]:
-        lines += ["", *claim_lines(result["claims"])]
+        blocks.append(claim_lines(result["claims"]))
     agreed = {name: row["consistency"] for name, row in result["rows"].items() if "consistency" in row}
     if agreed:
-        lines += [
-            "",
-            "Consistency loss before and after the descent, and the share of shapes for which it fell:",
-            "",
-        ]
-        lines += [
+        words = "Consistency loss before and after the descent, and the share of shapes for which it fell:"
+        shares = (
             f"- {name}: {found['searched']:.2f}, {found['descended']:.2f}, {found['lowered_share']:.1%}"
             for name, found in agreed.items()
-        ]
-    return "\n".join([*lines, ""])
+        )
+        blocks += [words, [*shares]]
+    return markdown_page(*blocks)
 
 
 def _cell(row: Mapping[str, Any], column: str) -> str:
     if column not in row["mean"]:
         return ""
-    paper = row["paper"].get(column)
     text = spread_text({"mean": row["mean"][column], "sd": row["sd"][column]})
-    return text if paper is None else f"{text} ({paper:.2f})"
+    return f"{text} ({row['paper'][column]:.2f})" if column in row["paper"] else text
 
 
-def _category_lines(result: Mapping[str, Any]) -> list[str]:
+def _category_blocks(result: Mapping[str, Any]) -> list[str | list[str]]:
     """CD and FPS-CD of every category and row; the means over shapes and over categories below."""
-    names, found = list(result["rows"]), result["categories"]
+    names, found = list(result["rows"]), result["categories"].values()
 
-    def cells(rows: Mapping[str, Mapping[str, float]]) -> list[str]:
+    def cells(rows: Mapping[str, Any]) -> list[str]:
         return [f"{rows[name]['cd']:.2f} ({rows[name]['fps_cd']:.2f})" for name in names]
 
     lines = [
         [kind, str(each["shapes"]), *cells(each["rows"]), ", ".join(c["verdict"] for c in each["claims"])]
-        for kind, each in found.items()
+        for kind, each in result["categories"].items()
     ]
-    of_categories = {
-        name: pd.DataFrame([each["rows"][name] for each in found.values()]).mean().to_dict() for name in names
-    }
-    over_shapes = cells({name: row["mean"] for name, row in result["rows"].items()})
-    lines.append(["mean over shapes", str(result["shapes"]), *over_shapes, ""])
-    lines.append(["mean over categories", "", *cells(of_categories), ""])
-    words = "; ".join(claim["words"] for claim in next(iter(found.values()))["claims"])
-    head = f"CD (FPS-CD) by category, and the verdicts on these claims there: {words}."
+    over_shapes = {name: row["mean"] for name, row in result["rows"].items()}
+    over_categories = {name: pd.DataFrame([each["rows"][name] for each in found]).mean() for name in names}
+    lines.append(["mean over shapes", str(result["shapes"]), *cells(over_shapes), ""])
+    lines.append(["mean over categories", "", *cells(over_categories), ""])
+    words = "; ".join(claim["words"] for claim in next(iter(found))["claims"])
     return [
-        head,
-        "",
-        *markdown_lines(["", "shapes", *names, "verdicts"], lines, "lr" + "r" * len(names) + "l"),
+        f"CD (FPS-CD) by category, and the verdicts on these claims there: {words}.",
+        markdown_lines(["", "shapes", *names, "verdicts"], lines, "lr" + "r" * len(names) + "l"),
     ]
 
 
@@ -358,12 +318,10 @@ def figure(result: Mapping[str, Any]) -> Figure:
     drawn = Figure(figsize=(3.2 * len(columns) + 2, 0.42 * len(rows) + 1.4), layout="constrained", dpi=110)
     panels = drawn.subplots(1, len(columns), sharey=True, squeeze=False)[0]
     for axes, column in zip(panels, columns, strict=True):
-        for height, name in enumerate(rows):
-            values = result["rows"][name]["by_seed"].get(column)
-            if values is None:
-                continue
-            axes.barh(height, result["rows"][name]["mean"][column], color="#cfe8e0", height=0.6)
-            axes.plot(values, [height] * len(values), "o", color="#1f6f8b", ms=5)
+        for height, row in enumerate(result["rows"].values()):
+            if column in row["mean"]:
+                axes.barh(height, row["mean"][column], color="#cfe8e0", height=0.6)
+                axes.plot(row["by_seed"][column], [height] * result["seeds"], "o", color="#1f6f8b", ms=5)
         axes.set(xlabel=NAMES[column] + (" x100" if column != "critic" else ""))
         axes.set_xlim(min(0, axes.get_xlim()[0]), None)
         figures.plain(axes)

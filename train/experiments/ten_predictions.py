@@ -48,13 +48,30 @@ def ten_predictions(row: Row, study: Study, config: FitConfig) -> Metrics:
     points, train = get_method(config.system).cloud_size(config), study.split(config, "train")
     some = torch.linspace(0, len(train) - 1, min(_NEAREST_AMONG, len(train))).long()
 
+    def measured(name: str, inputs: list, function: Callable[[Source, LoadedSplit], Metrics]) -> Metrics:
+        """Of the predictions of the row's network; or of samples of the ground truth in their place."""
+        if row.source == "truth":
+            test, source = (
+                study.split(config, "test"),
+                functools.partial(_samples, points=points, seed=config.seed),
+            )
+            key = [f"{name} of samples", config.seed, points, test.fingerprint, *inputs]
+            return study.kept(key, lambda: function(source, test))
+
+        def of_network(model: Predictor, test: LoadedSplit) -> Metrics:
+            return function(
+                lambda split, count: sample_predictions(model, split, codes=count, seed=config.seed), test
+            )
+
+        what = [f"{name} of predictions", _PREDICTIONS, *inputs]
+        return study.measure(config, what, of_network, stage=row.stage)
+
     def distances(source: Source, test: LoadedSplit) -> Metrics:
         real = train.points[some, :points]
-        return concatenate(
-            [_distances(shown, clouds, real=real) for _, shown, clouds in source(test, _PREDICTIONS)]
-        )
+        predictions = source(test, _PREDICTIONS)
+        return concatenate([_distances(shown, clouds, real=real) for _, shown, clouds in predictions])
 
-    found = _measure(row, study, config, "distances", [train.fingerprint, len(some)], distances)
+    found = measured("distances", [train.fingerprint, len(some)], distances)
     if row.critic_of is None:
         return found
     of_critic, steps = study.config(row.critic_of, seed=config.seed), study.steps or _STEPS
@@ -67,34 +84,7 @@ def ten_predictions(row: Row, study: Study, config: FitConfig) -> Metrics:
         )
 
     inputs = [study.weights_key(of_critic), trained_on.fingerprint, _TRAINED_PREDICTIONS, steps]
-    return found | _measure(
-        row, study, config, "critic", inputs, critic
-    )  # apart: the distances need no critic
-
-
-def _measure(
-    row: Row,
-    study: Study,
-    config: FitConfig,
-    name: str,
-    inputs: list,
-    function: Callable[[Source, LoadedSplit], Metrics],
-) -> Metrics:
-    """A measurement of the predictions of a row's network; or of samples of the ground truth in their place."""
-    if row.source == "truth":
-        test, points = study.split(config, "test"), get_method(config.system).cloud_size(config)
-        source = functools.partial(_samples, points=points, seed=config.seed)
-        key = [f"{name} of samples", config.seed, points, test.fingerprint, *inputs]
-        return study.kept(key, lambda: function(source, test))
-
-    def of_network(model: Predictor, test: LoadedSplit) -> Metrics:
-        return function(
-            lambda split, count: sample_predictions(model, split, codes=count, seed=config.seed), test
-        )
-
-    return study.measure(
-        config, [f"{name} of predictions", _PREDICTIONS, *inputs], of_network, stage=row.stage
-    )
+    return found | measured("critic", inputs, critic)  # apart: the distances need no critic
 
 
 def _samples(
@@ -136,11 +126,10 @@ def below_real_shapes(
     Args:
         source: of the predictions.
         test: held-out shapes, for which predictions are rated.
-        trained_on: training shapes, on which the critic is trained.
+        trained_on: training shapes, on which the critic is trained for so many `steps`.
         encode: clouds (B, N, 3) -> codes (B, D), of a frozen network.
         points: of a real cloud, as many as a prediction has.
         seed: draws the samples of real shapes, and the critic's batches.
-        steps: of its training.
 
     Returns:
         "critic": (M,) for each held-out shape, the critic's mean output for samples of it less that for predictions.
