@@ -90,9 +90,9 @@ def fit(horizons: Tensor, hidden: Tensor, steps: int) -> tuple[Tensor, float]:
         chosen = torch.randint(len(horizons), (2048,))
         horizon = horizons[chosen].flip(1) if step % 2 else horizons[chosen]
         horizon = torch.cat((horizon, unobstructed(64)))
-        truth = torch.cat((hidden[chosen], torch.zeros(64, dtype=torch.bool))).float()
+        target = torch.cat((hidden[chosen], torch.zeros(64, dtype=torch.bool))).float()
         score = reference.horizon_score(horizon, weights) + bias
-        loss = torch.nn.functional.binary_cross_entropy_with_logits(score, truth, pos_weight=weight)
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(score, target, pos_weight=weight)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

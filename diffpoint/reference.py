@@ -381,11 +381,11 @@ def front_constraint(
     """(B, V), view by view; see the public function for views without points."""
     height, width = depth.shape[-2:]
     _, _, visible = splat_depth(points, K, cam_from_world, height, width)
-    truth, lengths = unproject(depth, K, cam_from_world)
+    target, lengths = unproject(depth, K, cam_from_world)
     loss = []
     for b, v in itertools.product(*map(range, depth.shape[:2])):
         seen = points[b, visible[b, v]] if visible[b, v].any() else points[b]
-        observed = truth[b, v, : lengths[b, v]]
+        observed = target[b, v, : lengths[b, v]]
         if len(observed) == 0:
             loss.append(points.new_zeros(()))
         elif distance == "chamfer":

@@ -115,12 +115,12 @@ def soft_projection_loss(
     inner = slice(margin, margin + height), slice(margin, margin + width)
     losses = []
     for b, v in itertools.product(*map(range, depth.shape[:2])):
-        truth = depth.new_full(size, torch.inf)
-        truth[inner] = depth[b, v]
-        foreground = torch.isfinite(truth)
+        target = depth.new_full(size, torch.inf)
+        target[inner] = depth[b, v]
+        foreground = torch.isfinite(target)
         covered = coverage[b, v]
         both = foreground & torch.isfinite(rendered[b, v])
-        error = ((1 - torch.exp(-covered[both])) * (rendered[b, v][both] - truth[both]).abs()).sum()
+        error = ((1 - torch.exp(-covered[both])) * (rendered[b, v][both] - target[both]).abs()).sum()
         wrong = -(1 - torch.exp(-covered[foreground] - 0.01)).log().sum()
         silhouette = foreground.nonzero().to(points)
         for row, column in (~foreground).nonzero().tolist():

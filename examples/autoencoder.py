@@ -55,17 +55,17 @@ class AutoEncoder(nn.Module):
         return self.decode(codes).unflatten(-1, (-1, 3))
 
 
-def chamfer(predicted: Tensor, truth: Tensor) -> Tensor:
-    to_truth, to_predicted = dp.chamfer_distance(predicted, truth, squared=False)
-    return (to_truth + to_predicted).mean()
+def chamfer(predicted: Tensor, target: Tensor) -> Tensor:
+    to_target, to_predicted = dp.chamfer_distance(predicted, target, squared=False)
+    return (to_target + to_predicted).mean()
 
 
-def emd(predicted: Tensor, truth: Tensor, tolerance: float = 0.05) -> Tensor:
-    return dp.earth_mover_distance(predicted, truth, tolerance=tolerance).cost.mean()
+def emd(predicted: Tensor, target: Tensor, tolerance: float = 0.05) -> Tensor:
+    return dp.earth_mover_distance(predicted, target, tolerance=tolerance).cost.mean()
 
 
-def crowding(predicted: Tensor, truth: Tensor) -> float:
-    nearest = dp.nearest(truth, predicted).index
+def crowding(predicted: Tensor, target: Tensor) -> float:
+    nearest = dp.nearest(target, predicted).index
     counts = torch.zeros(predicted.shape[:2]).scatter_add(1, nearest, torch.ones(nearest.shape))
     return (counts.std(1) / counts.mean(1)).mean().item()
 
@@ -127,8 +127,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     clouds = make_clouds(arguments.shapes, 2 * arguments.seed)
     held_out = make_clouds(100, 2 * arguments.seed + 1)
-    seen, truth = held_out.split(arguments.points, dim=1)[:2]  # two samples of the same surfaces
-    rows, drawn = {}, {"truth": seen[: len(KINDS)]}
+    seen, target = held_out.split(arguments.points, dim=1)[:2]  # two samples of the same surfaces
+    rows, drawn = {}, {"ground truth": seen[: len(KINDS)]}
     for loss in LOSSES:
         begun = time.perf_counter()
         model = train(clouds, loss, points=arguments.points, steps=arguments.steps, seed=arguments.seed)
@@ -136,11 +136,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         with torch.no_grad():
             rows[loss] = model(seen)
         drawn[f"trained with {loss}"] = rows[loss][: len(KINDS)]
-    rows["(a sample of the truth)"] = seen
+    rows["(a sample of the ground truth)"] = seen
 
     table = ["| trained with | chamfer | EMD | crowding |", "|---|---:|---:|---:|"]
     for name, predicted in rows.items():
-        distances = 100 * chamfer(predicted, truth), 100 * emd(predicted, truth, tolerance=0.01)
+        distances = 100 * chamfer(predicted, target), 100 * emd(predicted, target, tolerance=0.01)
         table.append(
             f"| {name} | {distances[0]:.2f} | {distances[1]:.2f} | {crowding(predicted, held_out):.2f} |"
         )

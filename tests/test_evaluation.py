@@ -51,15 +51,15 @@ def test_missing_parts_cost_in_one_direction_only() -> None:
 
 
 def test_the_fscore_counts_points_within_a_hundredth() -> None:
-    truth = _lattice()[None]
-    near, far = truth + torch.tensor([0.009, 0.0, 0.0]), truth + torch.tensor([0.011, 0.0, 0.0])
-    assert cloud_errors(near, truth).fscore.item() == 1
-    assert cloud_errors(far, truth).fscore.item() == 0
-    # Half of the truth is predicted, and as many points elsewhere: precision 1/2, recall 1/2.
-    half = torch.cat([truth[:, :62], truth[:, :62] + 100], dim=1)
+    target = _lattice()[None]
+    near, far = target + torch.tensor([0.009, 0.0, 0.0]), target + torch.tensor([0.011, 0.0, 0.0])
+    assert cloud_errors(near, target).fscore.item() == 1
+    assert cloud_errors(far, target).fscore.item() == 0
+    # Half of the target is predicted, and as many points elsewhere: precision 1/2, recall 1/2.
+    half = torch.cat([target[:, :62], target[:, :62] + 100], dim=1)
     precision, recall = 0.5, 62 / 125
     expected = 2 * precision * recall / (precision + recall)
-    assert cloud_errors(half, truth).fscore.item() == pytest.approx(expected)
+    assert cloud_errors(half, target).fscore.item() == pytest.approx(expected)
 
 
 def test_the_transport_error_of_a_shift_is_the_shift_and_sees_crowding() -> None:
@@ -68,11 +68,11 @@ def test_the_transport_error_of_a_shift_is_the_shift_and_sees_crowding() -> None
     shifted = cloud + torch.tensor([0.0, 0.03, 0.04])
     assert transport_error(shifted, cloud, points=64).item() == pytest.approx(5.0, rel=0.021)
     assert transport_error(cloud, cloud, points=16).item() == 0
-    # Every point of the first cloud is a point of the truth, but crowded on one half of it.
-    truth = _lattice()[None]
-    crowded = truth[:, :50].repeat(1, 3, 1)[:, :125]
-    assert cloud_errors(crowded, truth).pred_to_gt.item() == 0
-    assert transport_error(crowded, truth, points=125).item() > 50
+    # Every point of the first cloud is a point of the target, but crowded on one half of it.
+    target = _lattice()[None]
+    crowded = target[:, :50].repeat(1, 3, 1)[:, :125]
+    assert cloud_errors(crowded, target).pred_to_gt.item() == 0
+    assert transport_error(crowded, target, points=125).item() > 50
 
 
 def test_thinning_keeps_a_spread_out_subset_and_small_clouds_whole() -> None:

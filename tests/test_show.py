@@ -55,7 +55,7 @@ def example() -> figures.Example:
         chosen=3,
         predictions=torch.rand(4, 100, 3) - 0.5,
         reconstruction=torch.rand(500, 3) - 0.5,
-        truth=cloud,
+        target=cloud,
     )
 
 
@@ -109,7 +109,7 @@ def test_from_behind_is_the_same_height_on_the_other_side():
 
 
 def test_a_close_up_keeps_the_object_and_every_pixel_of_it(example: figures.Example):
-    small = example.truth * 0.5
+    small = example.target * 0.5
     images, camera = figures.close_up(example.images, example.camera, small)
     cut = (32 - camera.width) // 2
     assert 4 <= cut < 16
@@ -121,7 +121,7 @@ def test_a_close_up_keeps_the_object_and_every_pixel_of_it(example: figures.Exam
 
 
 def test_a_close_up_of_what_fills_the_frame_cuts_nothing(example: figures.Example):
-    images, camera = figures.close_up(example.images, example.camera, example.truth * 4)
+    images, camera = figures.close_up(example.images, example.camera, example.target * 4)
     assert images.shape == example.images.shape
     assert (camera.height, camera.width) == (32, 32)
 

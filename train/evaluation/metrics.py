@@ -28,7 +28,7 @@ class CloudErrors(NamedTuple):
 
     Attributes:
         gt_to_pred: (*B) mean distance from a true point to the prediction.
-        pred_to_gt: (*B) mean distance from a predicted point to the truth.
+        pred_to_gt: (*B) mean distance from a predicted point to the target.
         fscore: (*B) harmonic mean of precision and recall in [0, 1]: the shares of predicted and of true points within
             `FSCORE_DISTANCE` of the other cloud. Two samplings of one surface reach 1 only if both are dense enough.
     """
@@ -43,28 +43,28 @@ class CloudErrors(NamedTuple):
         return self.gt_to_pred + self.pred_to_gt
 
 
-def cloud_errors(predicted: Tensor, truth: Tensor) -> CloudErrors:
+def cloud_errors(predicted: Tensor, target: Tensor) -> CloudErrors:
     """Compares clouds (*B, N, 3) with clouds (*B, M, 3)."""
-    to_truth = nearest(predicted, truth).squared_distance.sqrt()
-    to_prediction = nearest(truth, predicted).squared_distance.sqrt()
-    precision, recall = ((d <= FSCORE_DISTANCE).to(d.dtype).mean(-1) for d in (to_truth, to_prediction))
+    to_target = nearest(predicted, target).squared_distance.sqrt()
+    to_prediction = nearest(target, predicted).squared_distance.sqrt()
+    precision, recall = ((d <= FSCORE_DISTANCE).to(d.dtype).mean(-1) for d in (to_target, to_prediction))
     return CloudErrors(
         gt_to_pred=100 * to_prediction.mean(-1),
-        pred_to_gt=100 * to_truth.mean(-1),
+        pred_to_gt=100 * to_target.mean(-1),
         fscore=2 * precision * recall / (precision + recall).clamp(min=1e-12),
     )
 
 
-def transport_error(predicted: Tensor, truth: Tensor, *, points: int) -> Tensor:
+def transport_error(predicted: Tensor, target: Tensor, *, points: int) -> Tensor:
     """(*B) mean earth mover's distance x100 between both clouds thinned to equal size, at most 2 % above the optimum.
 
     Args:
         predicted: (*B, N, 3).
-        truth: (*B, M, 3).
+        target: (*B, M, 3).
         points: number of points, at most, to which both clouds are thinned by farthest point sampling.
     """
-    points = min(points, predicted.shape[-2], truth.shape[-2])
-    pair = thin_out(predicted, points), thin_out(truth, points)
+    points = min(points, predicted.shape[-2], target.shape[-2])
+    pair = thin_out(predicted, points), thin_out(target, points)
     return 100 * earth_mover_distance(*pair, tolerance=_EMD_TOLERANCE).cost
 
 

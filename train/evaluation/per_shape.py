@@ -65,15 +65,15 @@ def evaluate_split(
     draw = seed if code_seed is None else code_seed
     for start in range(0, len(test), SHAPES_AT_ONCE):
         shapes = torch.arange(start, min(start + SHAPES_AT_ONCE, len(test)))
-        images, truth = test.float_images(shapes, order[shapes, :views]), test.points[shapes]
+        images, target = test.float_images(shapes, order[shapes, :views]), test.points[shapes]
         found = reconstruct(model, images, seed=draw * 10_000 + start, settings=settings)
         by_view = None if model.reads_views_together else found.points.unflatten(1, (views, -1))
         if settings.scored == "each" and by_view is not None:
-            each = compare_clouds(by_view, truth[:, None].expand(-1, views, -1, -1), points=model.points)
+            each = compare_clouds(by_view, target[:, None].expand(-1, views, -1, -1), points=model.points)
             metrics = {name: values.mean(1) for name, values in each.items()}
             metrics["best_cd"] = each["cd"].amin(1)
         else:
-            metrics = compare_clouds(found.points, truth, points=model.points)
+            metrics = compare_clouds(found.points, target, points=model.points)
         metrics["code_norm"] = found.codes.norm(dim=-1).mean(1)
         if len(found.history):
             metrics["searched"] = found.history[0]
@@ -85,16 +85,16 @@ def evaluate_split(
     return concatenate(parts)
 
 
-def compare_clouds(predicted: Tensor, truth: Tensor, *, points: int) -> ShapeMetrics:
+def compare_clouds(predicted: Tensor, target: Tensor, *, points: int) -> ShapeMetrics:
     """Metrics of clouds (*B, N, 3) against ground truth (*B, M, 3), each (*B).
 
     Args:
         predicted: the predictions, concatenated over views.
-        truth: the ground truth.
+        target: the ground truth.
         points: size of one prediction, to which predictions are thinned for the fps_ metrics, and both clouds for the
             earth mover's distance.
     """
-    errors, thinned = cloud_errors(predicted, truth), cloud_errors(thin_out(predicted, points), truth)
+    errors, thinned = cloud_errors(predicted, target), cloud_errors(thin_out(predicted, points), target)
     return {
         "gt_to_pred": errors.gt_to_pred,
         "pred_to_gt": errors.pred_to_gt,
@@ -103,7 +103,7 @@ def compare_clouds(predicted: Tensor, truth: Tensor, *, points: int) -> ShapeMet
         "fps_gt_to_pred": thinned.gt_to_pred,
         "fps_pred_to_gt": thinned.pred_to_gt,
         "fscore_01": errors.fscore,
-        "emd": transport_error(predicted, truth, points=points),
+        "emd": transport_error(predicted, target, points=points),
     }
 
 

@@ -42,7 +42,7 @@ class Example(NamedTuple):
     """(R, N, 3) predictions from that view with R codes."""
     reconstruction: Tensor
     """(M, 3) reconstruction from all views."""
-    truth: Tensor
+    target: Tensor
     """(P, 3) ground truth."""
 
     @property
@@ -130,7 +130,7 @@ def predictions_figure(*examples: Example) -> Figure:
         for row, camera in zip(pair, example.sides, strict=True):
             for axes, cloud in zip(row[1:-1], example.predictions, strict=True):
                 draw_cloud(axes, cloud, camera)
-            draw_cloud(row[-1], example.truth, camera, colours=TRUE)
+            draw_cloud(row[-1], example.target, camera, colours=TRUE)
         _sides(pair[:, 1])
     titles(panels, ["the image", *(f"random code {i + 1}" for i in range(count)), "the true shape"])
     return figure
@@ -143,7 +143,7 @@ def reconstruction_figure(example: Example) -> Figure:
     for axes, camera in zip(panels[0, 1:3], example.sides, strict=True):
         draw_cloud(axes, example.reconstruction, camera)
     for axes, camera in zip(panels[0, 3:], example.sides, strict=True):
-        draw_cloud(axes, example.truth, camera, colours=TRUE)
+        draw_cloud(axes, example.target, camera, colours=TRUE)
     titles(
         panels,
         [f"{len(example.images)} images", "reconstruction", "from behind", "the true shape", "from behind"],
@@ -162,7 +162,7 @@ def overview_figure(examples: Sequence[Example]) -> Figure:
             for axes, cloud in zip(row[1:-2], example.predictions, strict=True):
                 draw_cloud(axes, cloud, camera)
             draw_cloud(row[-2], example.reconstruction, camera)
-            draw_cloud(row[-1], example.truth, camera, colours=TRUE)
+            draw_cloud(row[-1], example.target, camera, colours=TRUE)
         _sides([upper[1], lower[1]])
     guesses = [f"from this image, code {i + 1}" for i in range(count)]
     titles(panels, ["one image / all images", *guesses, f"from all {views} images", "the true shape"])

@@ -24,8 +24,8 @@ _INTRODUCTION = (
     "not used for training."
 )
 _COLUMNS = {
-    "gt_to_pred": "truth to prediction",
-    "pred_to_gt": "prediction to truth",
+    "gt_to_pred": "ground truth to prediction",
+    "pred_to_gt": "prediction to ground truth",
     "cd": "sum (CD)",
     "fps_cd": "CD, equal points",
     "consistency": "disagreement",
@@ -125,7 +125,7 @@ def _reconstructions(examples: Sequence[Example], drawn: Mapping[str, Figure]) -
         pages.row(
             [
                 pages.cloud(first.reconstruction, f"Object 1, from {views} images", colours="Viridis"),
-                pages.cloud(first.truth, "Object 1, the true shape", colours="Oranges"),
+                pages.cloud(first.target, "Object 1, the true shape", colours="Oranges"),
             ],
             kind="pair",
         ),

@@ -31,12 +31,12 @@ def draw_predictions(model: Predictor, val: LoadedSplit, path: str | Path, *, se
         batch = val.batch(shape[None], views[None])
         codes = torch.randn(_CODES, val.views, model.code_dim, generator=generator)
         clouds = model(batch.images[0], codes)
-        truth = val.points[shape]
+        target = val.points[shape]
         images, camera = figures.close_up(
-            _square(batch.images[0]), batch.camera[0].resize(_PIXELS, _PIXELS), truth
+            _square(batch.images[0]), batch.camera[0].resize(_PIXELS, _PIXELS), target
         )
         joined = clouds[0].flatten(0, 1)
-        examples.append(figures.Example(images, camera, 0, clouds[:, 0], joined, truth))
+        examples.append(figures.Example(images, camera, 0, clouds[:, 0], joined, target))
     figures.save(figures.overview_figure(examples), path)
 
 

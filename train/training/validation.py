@@ -36,14 +36,14 @@ def validate(model: Predictor, split: LoadedSplit, *, seed: int, world: World = 
             first = model.predict_views(images[:, :1], codes[shapes, :1])
         if model.joins_views:
             clouds = clouds.flatten(1, 2)[:, None]
-        truth = split.points[shapes][:, None]
+        target = split.points[shapes][:, None]
         seen = split.batch(shapes, views[:, :1])
-        each_truth = truth.expand(-1, clouds.shape[1], -1, -1)
+        each_target = target.expand(-1, clouds.shape[1], -1, -1)
         sums += torch.stack(
             [
-                cloud_errors(first, truth).cd.sum(),
-                cloud_errors(clouds, each_truth).cd.mean(1).sum(),
-                cloud_errors(thin_out(clouds, model.points), each_truth).cd.mean(1).sum(),
+                cloud_errors(first, target).cd.sum(),
+                cloud_errors(clouds, each_target).cd.mean(1).sum(),
+                cloud_errors(thin_out(clouds, model.points), each_target).cd.mean(1).sum(),
                 visible_error(first[:, 0], seen.camera, seen.depth).sum(),
                 in_silhouette(first[:, 0], seen.camera, seen.depth).float().mean(-1).sum(),
             ]
@@ -63,6 +63,8 @@ def validate_autoencoder(model: Autoencoder, split: LoadedSplit, *, seed: int) -
     some = torch.randperm(split.points.shape[1], generator=generator)[: model.config.points]
     training = model.training
     model.eval()
-    errors = [cloud_errors(model(truth[:, some]), truth).cd for truth in split.points.split(_SHAPES_AT_ONCE)]
+    errors = [
+        cloud_errors(model(target[:, some]), target).cd for target in split.points.split(_SHAPES_AT_ONCE)
+    ]
     model.train(training)
     return {"val_autoencoder_cd": torch.cat(errors).mean().item()}
