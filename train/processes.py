@@ -119,7 +119,7 @@ def _results(
     idle: list[_Worker] = []
     busy: dict[Any, tuple[_Worker, int]] = {}
     failed: BaseException | None = None
-    finished = False
+    interrupted = True
     with StopRequest() as stop:
         try:
             while busy or (waiting and failed is None):
@@ -142,10 +142,13 @@ def _results(
                         failed = failed or result
                 if stop.requested:
                     raise KeyboardInterrupt
-            finished = True
+            interrupted = False
+        except GeneratorExit:  # the caller has stopped: running calls are finished, so that no file is half-written
+            interrupted = stop.requested
+            raise
         finally:
             workers = [*idle, *(worker for worker, _ in busy.values())]
-            if not finished:
+            if interrupted:
                 for worker in workers:
                     worker.process.terminate()
             for worker in workers:
