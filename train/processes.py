@@ -143,7 +143,8 @@ def _results(
                 if stop.requested:
                     raise KeyboardInterrupt
             interrupted = False
-        except GeneratorExit:  # the caller has stopped: running calls are finished, so that no file is half-written
+        except GeneratorExit:
+            # The caller has stopped: running calls are finished, so that no file is left half-written.
             interrupted = stop.requested
             raise
         finally:
