@@ -24,7 +24,7 @@ from train.config import FitConfig, Profile, fit_config_from_json, renamed_optio
 from train.data_commands import Data
 from train.errors import UserError
 from train.experiments.registry import ABOUT_ALL, EXPERIMENTS, FORMER_NAMES
-from train.methods import METHODS, recipe
+from train.methods import METHODS, get_method
 
 # Torch and the kernels are imported by the commands, so that --help answers at once.
 
@@ -291,12 +291,9 @@ def _fit_defaults(arguments: list[str]) -> FitConfig:
     if "--resume" in arguments and saved.is_file():
         return fit_config_from_json(saved.read_text(), where=str(saved))
     profile = given.get("--profile", "cpu")
-    config = recipe(given.get("--system", "ours"), profile if profile in get_args(Profile) else "cpu")
-    if given.get("--variant") == "highly-diverse" and config.system == "ours":
-        from train.methods.ours import highly_diverse
-
-        return highly_diverse(config)
-    return config
+    method = get_method(given.get("--system", "ours"))
+    config = method.recipe(profile if profile in get_args(Profile) else "cpu")
+    return method.variant(config, given.get("--variant", "standard"))
 
 
 if __name__ == "__main__":

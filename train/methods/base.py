@@ -124,6 +124,10 @@ class Method(ABC):
         """The recipe to assume for a network that comes without the configuration of its training."""
         return self.recipe(network.profile)
 
+    def variant(self, config: FitConfig, name: str) -> FitConfig:
+        """A recipe changed to one of the method's variants; `check` refuses the names that a method does not have."""
+        return config
+
     def check(self, config: FitConfig) -> None:
         """Refuses settings that the method does not have.
 

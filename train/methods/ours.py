@@ -155,6 +155,9 @@ class Ours(Method):
     def recipe(self, profile: str) -> FitConfig:
         return PROFILES[profile]
 
+    def variant(self, config: FitConfig, name: str) -> FitConfig:
+        return highly_diverse(config) if name == "highly-diverse" else config
+
     def network_config(self, config: FitConfig) -> GeneratorConfig:
         return dataclasses.replace(
             SIZES[config.profile],
