@@ -14,15 +14,20 @@ import diffpoint
 ROOT = Path(__file__).parent.parent
 
 
-def test_imports_point_down():
-    """The contracts are in pyproject.toml."""
-    done = subprocess.run(
+def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
+    """Checks the contracts of the pyproject.toml in a folder against the packages beside it."""
+    return subprocess.run(
         [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
         capture_output=True,
         text=True,
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root)},
     )
+
+
+def test_imports_point_down():
+    """The contracts are in pyproject.toml."""
+    done = lint_imports(ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -35,13 +40,7 @@ def test_an_upward_import_is_found(tmp_path):
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     with (tmp_path / "train" / "data" / "cache.py").open("a") as file:
         file.write("\nfrom train.methods.base import Method\n")
-    done = subprocess.run(
-        [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-    )
+    done = lint_imports(tmp_path)
     assert done.returncode == 1
     assert "train.data.cache -> train.methods.base" in done.stdout
 

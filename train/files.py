@@ -1,4 +1,4 @@
-"""Atomic writes: a reader sees the old file or the whole new one, never half of it."""
+"""Paths, and atomic writes: a reader sees the old file or the whole new one, never half of it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,18 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS})
 """Errors after which no other file can be written either: the disk is full or read-only."""
+
+
+def as_paths(paths: str | Path | Sequence[str | Path]) -> list[Path]:
+    """One path or several, as a list."""
+    return [Path(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
 
 
 @contextmanager

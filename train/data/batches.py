@@ -26,6 +26,7 @@ from train.data.shape import Shape
 from train.data.shrink import Pool, Sizes
 from train.data.tree import ShapeTree
 from train.errors import UserError
+from train.files import as_paths
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -153,7 +154,7 @@ def load_split(
     Raises:
         UserError: no such tree, no usable shape, or renders whose side is not a multiple of `map_size`.
     """
-    roots = [Path(root) for root in ([data] if isinstance(data, str | Path) else data)]
+    roots = as_paths(data)
     trees = [ShapeTree(root, split, list(categories) or None) for root in roots]
     total = sum(map(len, trees))
     if limit is not None and total > limit:

@@ -31,7 +31,7 @@ from train.data.mesh_sources import (
 from train.data.render import Orbit, Renderer, draw_camera, orbit_camera
 from train.data.surface import Surface, sample_triangles
 from train.errors import UserError
-from train.files import write_text
+from train.files import as_paths, write_text
 from train.processes import map_unordered
 
 LEFT_OUT = "left_out.csv"
@@ -160,7 +160,7 @@ def convert(
     """
     options, out = options or MeshOptions(), Path(out)
     labels = None if labels is None else Path(labels)
-    sources = [sources] if isinstance(sources, str | Path) else sources
+    sources = as_paths(sources)
     tree_files.require_between(size=(size, 16, 2048), views=(views, 1, 256))
     if labels is not None and options.category is not None:
         raise UserError("labels and category both set the category of the meshes; give one of them")

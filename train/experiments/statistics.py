@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from torch import Tensor
 
+from train.evaluation.per_shape import stack_seeds
 from train.experiments.store import Metrics
 from train.show.tables import markdown_lines
 
@@ -24,7 +24,7 @@ CLAIM_ALIGNMENT = "lrrl"
 
 def stacked(by_seed: Sequence[Metrics]) -> dict[str, np.ndarray]:
     """The metrics (M,) of several trainings as arrays (S, M) in float64."""
-    return {name: torch.stack([found[name].double() for found in by_seed]).numpy() for name in by_seed[0]}
+    return {name: values.double().numpy() for name, values in stack_seeds(by_seed).items()}
 
 
 def spread(by_seed: Sequence[float] | np.ndarray | Tensor) -> dict[str, Any]:

@@ -79,9 +79,10 @@ def read_weights(path: Path, *kinds: type[_Network]) -> _Network:
         with safe_open(path, framework="pt") as file:
             headers = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-        found = [_kinds()[kind] for kind in kinds if _kinds()[kind].header in headers]
+        known = _kinds()
+        found = [known[kind] for kind in kinds if known[kind].header in headers]
         if not found:
-            raise ValueError(f"it has no {_kinds()[kinds[0]].header} header")
+            raise ValueError(f"it has no {known[kinds[0]].header} header")
         name, build = found[0]
         model = build(_settings(json.loads(headers[name])))
         theirs, ours = (

@@ -28,7 +28,7 @@ from train.evaluation.runs import (
     load_predictor,
     read_split,
 )
-from train.files import write_text
+from train.files import as_paths, write_text
 from train.methods import get_method
 from train.methods.base import Noise, Step, adam, check_finite, set_learning_rate
 from train.methods.weights import save_weights
@@ -68,7 +68,7 @@ def fit(
     Raises:
         UserError: unusable data or run, a configuration that does not fit them, or a training that has failed.
     """
-    roots, out = [Path(root) for root in ([data] if isinstance(data, (str, Path)) else data)], Path(out)
+    roots, out = as_paths(data), Path(out)
     world = connect()
     progress = progress and world.is_main
     _check_run_directory(out, config, resume=resume)
