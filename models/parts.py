@@ -128,7 +128,7 @@ class PointDecoder(_Contraction):
         self.merge4 = _conv_relu(c128, (c128, 3, 1))
         self.up3, self.skip3 = _deconv(c128, c64), _conv(joined, c64)
         self.merge3 = _conv_relu(c64, (c64, 3, 1), (c64, 3, 1))
-        self.conv_points = _conv(c64, 2 * self.values)
+        self.conv_points = _conv(c64, config.points_per_cell * self.values)
 
     def forward(self, joined: Tensor) -> Tensor:
         x4, x5, bottleneck, vector = self.contract(joined)

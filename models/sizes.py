@@ -25,6 +25,7 @@ class GeneratorConfig:
             "latent": the network predicts a latent code of the auto-encoder of shapes, whose frozen decoder, set by
             `adopt_decoder`, computes the points (the network of the paper's text).
         occupancy_logits: also predict an occupancy logit for every point, for losses that may delete points.
+        points_per_cell: points that the convolutional branch predicts in each grid cell; the paper's has two.
     """
 
     profile: str = "cpu"
@@ -35,6 +36,7 @@ class GeneratorConfig:
     deterministic: bool = False
     output_head: OutputHead = "points"
     occupancy_logits: bool = False
+    points_per_cell: int = 2
 
     def __post_init__(self) -> None:
         if self.image_height % 8 or self.image_width % 8 or min(self.image_height, self.image_width) < 8:
@@ -45,6 +47,10 @@ class GeneratorConfig:
         if self.output_head not in ("points", "latent"):
             raise ValueError(
                 f"GeneratorConfig: output_head must be 'points' or 'latent'; got {self.output_head!r}"
+            )
+        if self.points_per_cell < 1:
+            raise ValueError(
+                f"GeneratorConfig: points_per_cell must be at least 1; got {self.points_per_cell}"
             )
         if self.occupancy_logits and self.output_head == "latent":
             raise ValueError(
@@ -63,8 +69,8 @@ class GeneratorConfig:
 
     @property
     def conv_points(self) -> int:
-        """Points of the convolutional branch: two per grid cell."""
-        return 2 * self.grid[0] * self.grid[1]
+        """Points of the convolutional branch."""
+        return self.points_per_cell * self.grid[0] * self.grid[1]
 
     @property
     def fc_points(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -235,6 +236,25 @@ def test_fit_shows_its_methods_and_the_defaults_of_profile_and_method(
         shown = capsys.readouterr().out
         assert f"(default: {steps})" in shown
         assert all(f"{name}: {method.summary[:20]}" in shown for name, method in METHODS.items())
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "weight"),
+    [
+        ([], "whole-shapes", 2.0),
+        (["--recipe", "paper"], "paper", 0.0),
+        (["--variant", "highly-diverse"], "paper", 0.0),
+        (["--system", "psgn"], "paper", 0.0),
+    ],
+)
+def test_fit_learns_from_whole_shapes_unless_the_paper_is_asked_for(
+    options: list[str], name: str, weight: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["fit", *options, "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert re.search(rf"--recipe \{{whole-shapes,paper\}} .{{0,300}}\(default: {name}\)", shown)
+    assert re.search(rf"--stage1.shape-weight FLOAT .{{0,300}}\(default: {weight}\)", shown)
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "I;16", "I", "F"])

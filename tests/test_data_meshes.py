@@ -235,6 +235,21 @@ def test_labels_choose_and_name(tmp_path):
     assert ids == ["03001627/a", "03636649/c", "garden_gnome/b"]
 
 
+def test_meshes_without_a_label_are_made_too_and_leave_the_split_of_the_others(tmp_path):
+    for number in range(12):
+        save_box(tmp_path / "lib" / f"m{number}" / "model.obj")
+    rows = [("lib", f"m{number}/model.obj", "chair", "", "") for number in range(8)]
+    labels = write_labels(tmp_path / "labels.csv", rows)
+    convert([tmp_path / "lib"], tmp_path / "few", labels=labels, **SMALL)
+    report = convert([tmp_path / "lib"], tmp_path / "all", labels=labels, unlabelled=True, **SMALL)
+    assert report.categories == {"chair": 8, "unknown": 4}
+    for split in tree_files.SPLITS:
+        few, everything = (tmp_path / name / tree_files.LISTS / split for name in ("few", "all"))
+        assert (few / "03001627.list").read_text() == (everything / "03001627.list").read_text()
+    with pytest.raises(UserError, match="give labels too"):
+        convert([tmp_path / "lib"], tmp_path / "none", unlabelled=True, **SMALL)
+
+
 def test_labels_that_fit_nothing_or_are_none(tmp_path):
     save_box(tmp_path / "lib" / "a.obj")
     foreign = write_labels(tmp_path / "foreign.csv", [("other", "a.obj", "chair", "", "")])

@@ -94,6 +94,11 @@ def test_variants_share_views_of_one_object(tmp_path):
     assert len({(folder / "camera_0.json").read_text() for folder in folders}) == 1
     clouds = {tree_files.cloud_file(tmp_path / "data", f"03001627/{f.name}").read_bytes() for f in folders}
     assert len(clouds) == 3
+    command = "data procedural --shapes 1 --categories chair --variants 3 --size 32 --views 1 --out"
+    assert main([*command.split(), str(tmp_path / "same")]) == 0
+    assert files_of(tmp_path / "same" / tree_files.RENDERS) == files_of(
+        tmp_path / "data" / tree_files.RENDERS
+    )
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from train.evaluation.runs import config_of, load_generator, load_predictor, rea
 from train.methods import METHODS, get_method, recipe
 from train.methods.base import Step
 from train.methods.lin import fixed_depth
-from train.methods.losses import diversity_term, front_loss, pair_with_views
+from train.methods.losses import diversity_term, front_loss, nearest_prediction_loss, pair_with_views
 from train.methods.ours import highly_diverse
 from train.methods.voxel_targets import hull_cells, solid_cells
 from train.methods.weights import method_of
@@ -71,6 +71,20 @@ def test_recipes_have_a_loss_for_each_phase_and_a_network_of_the_common_size(
         assert method.build(config).points == method.cloud_size(config)
 
 
+def test_the_recipe_of_whole_shapes_is_the_default_and_differs_where_it_should() -> None:
+    method = get_method("ours")
+    assert method.recipes[0] == "whole-shapes"
+    for profile, paper in _OURS.items():
+        config = recipe("ours", profile, "whole-shapes")
+        method.check(config)
+        assert paper.recipe == "paper"
+        assert not any(method.needs_targets(stage) or stage.shape_weight for stage in paper.stages)
+        assert all(method.needs_targets(stage) and stage.codes > 1 for stage in config.stages)
+        assert not any(stage.beta or stage.gamma for stage in config.stages)
+        assert method.build(config).points == method.cloud_size(config) == 2 * SIZES[profile].points
+        assert fit_config_from_json(to_json(config, data=Path("d")), where="") == config
+
+
 def test_a_name_of_no_method_is_refused_with_the_names_of_all() -> None:
     with pytest.raises(UserError, match=f"must be one of {', '.join(METHODS)}; got 'none'"):
         recipe("none", "smoke")
@@ -88,6 +102,8 @@ def test_a_name_of_no_method_is_refused_with_the_names_of_all() -> None:
         ("psgn", {"deterministic": True}, "does not support"),
         ("psgn", {"variant": "highly-diverse"}, "does not support"),
         ("psgn", {"precision": "bfloat16"}, "computes in float32"),
+        ("psgn", {"recipe": "whole-shapes"}, "has no recipe whole-shapes; leave --recipe at paper"),
+        ("psgn", {"points_per_cell": 4}, "has a network and a loss of its own; do not set --points"),
         ("ptn", {"stage2": recipe("ptn", "smoke").stage1}, "has no stage2; leave its steps at 0"),
     ],
 )
@@ -247,6 +263,57 @@ def test_only_the_best_of_n_predictions_gets_a_gradient(tiny_data: Path) -> None
     assert report["loss"] < report["mean_of_all"]
     (gradient,) = torch.autograd.grad(report["loss"], codes)
     assert (gradient.abs().sum(2) > 0).sum(0).tolist() == [1] * codes.shape[1]
+
+
+def _flat_clouds(*, offset: float = 0.0) -> torch.Tensor:
+    """(2, 3, 600, 3): two predictions for each of three images, squares at depth 0, or at depth 1."""
+    square = torch.rand(600, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([1.0, 1, 0])
+    return torch.stack([square, square + torch.tensor([0, 0, 1.0])])[:, None].repeat(1, 3, 1, 1) + offset
+
+
+def test_only_the_prediction_nearest_to_the_whole_shape_is_trained_on_it() -> None:
+    """The shapes of the second and third image are the square at depth 1, which is their second prediction."""
+    stage = dataclasses.replace(_OURS["cpu"].stage1, shape_weight=1.0)
+    clouds = _flat_clouds(offset=0.01).requires_grad_()
+    targets = _flat_clouds()[torch.tensor([0, 1, 1]), torch.arange(3)]
+    loss, statistics = nearest_prediction_loss(clouds, targets, stage, step=3)
+    (gradient,) = torch.autograd.grad(loss, clouds)
+    trained = gradient.abs().sum((2, 3)) > 0
+    assert trained.tolist() == [[True, False, False], [False, True, True]]
+    assert (gradient.abs().sum(3) > 0).sum(2).amax() == 512  # a part of the points in each step
+    nearest, others = statistics["nearest_emd"].item(), statistics["mean_emd"].item()
+    assert nearest == pytest.approx(5, abs=4)
+    assert others == pytest.approx((nearest + 100) / 2, rel=0.1)
+    again, _ = nearest_prediction_loss(clouds, targets, stage, step=3)
+    later, _ = nearest_prediction_loss(clouds, targets, stage, step=4)
+    assert again == loss != later
+
+
+def test_the_whole_shape_loss_is_of_the_distance_that_was_asked_for() -> None:
+    clouds, targets = _flat_clouds(offset=0.02)[:1], _flat_clouds()[0]
+    stage = dataclasses.replace(_OURS["cpu"].stage1, shape_weight=1.0)
+    found = {
+        distance: nearest_prediction_loss(
+            clouds, targets, dataclasses.replace(stage, shape_distance=distance), step=0
+        )[0].item()
+        for distance in ("emd", "chamfer", "both")
+    }
+    both = chamfer_distance(clouds[0], targets, squared=False)
+    assert found["chamfer"] == pytest.approx(100 * (both.a_to_b + both.b_to_a).mean().item(), rel=1e-5)
+    assert found["both"] == pytest.approx(found["emd"] + found["chamfer"], rel=1e-5)
+
+
+def test_a_prediction_of_every_back_at_once_costs_more_than_one_of_the_right_back() -> None:
+    """Half of the points on each of two possible backs: near by chamfer, far by the earth mover's distance."""
+    one, other = _flat_clouds()[:, 0]
+    everything = torch.cat([one[:300], other[300:]])
+    stage = dataclasses.replace(_OURS["cpu"].stage1, shape_weight=1.0, shape_distance="emd")
+
+    def loss(cloud: torch.Tensor, target: torch.Tensor) -> float:
+        return nearest_prediction_loss(cloud[None, None], target[None], stage, step=0)[0].item()
+
+    assert loss(everything, one) > loss(one, one) + 40
+    assert loss(everything, other) > loss(other, other) + 40
 
 
 # --- targets and oracles

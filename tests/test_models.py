@@ -231,7 +231,15 @@ def test_sizes_of_ones_own() -> None:
     assert clouds.shape[2] == model.points == 128 + 42
 
 
+def test_more_points_in_each_cell_are_more_points_of_both_branches() -> None:
+    model = build_generator(config=dataclasses.replace(PROFILES["smoke"], points_per_cell=4))
+    clouds = model(torch.rand(1, 3, 48, 64), torch.randn(2, 1, CODE_DIM))
+    assert clouds.shape[2] == model.points == 2 * PROFILES["smoke"].points
+
+
 def test_wrong_sizes_are_named() -> None:
+    with pytest.raises(ValueError, match="points_per_cell"):
+        GeneratorConfig(points_per_cell=0)
     with pytest.raises(ValueError, match="multiples of 8"):
         GeneratorConfig(image_height=50)
     with pytest.raises(ValueError, match="'images'"):

@@ -23,7 +23,7 @@ from safetensors.torch import load_file, save_file
 from models import build_generator
 from tests.one_step_each import one_step_each
 from train.__main__ import main
-from train.config import FitConfig
+from train.config import FitConfig, with_steps
 from train.data import tree_files
 from train.data.batches import LoadedSplit, load_split
 from train.data.render import Renderer, draw_camera
@@ -143,6 +143,24 @@ def test_a_run_killed_in_every_phase_and_at_every_border_ends_in_the_same_bits(
     before = (run / "metrics.jsonl").read_bytes()
     assert fit(tiny_data, run, _SMOKE, resume=True, progress=False)
     assert (run / "metrics.jsonl").read_bytes() == before
+
+
+def test_a_training_on_whole_shapes_with_changed_images_is_resumed_too(
+    interrupt: Any, monkeypatch: pytest.MonkeyPatch, tiny_data: Path, tmp_path: Path
+) -> None:
+    config = with_steps(recipe("ours", "smoke", "whole-shapes"), 8)
+    config = dataclasses.replace(config, checkpoint_every=3, picture_every=0, validate_every=5)
+    assert fit(tiny_data, tmp_path / "whole", config, progress=False)
+    records = read_metrics(tmp_path / "whole")
+    assert all(0 < record["nearest_emd"] <= record["mean_emd"] for record in records)
+    assert all(record["front"] > 0 and record["diversity"] == 0 for record in records)
+    for steps in (4, 11):
+        interrupt(steps)
+        with pytest.raises(_Killed):
+            fit(tiny_data, tmp_path / "run", config, resume=steps > 4, progress=False)
+    monkeypatch.undo()
+    assert fit(tiny_data, tmp_path / "run", config, resume=True, progress=False)
+    _assert_same_run(tmp_path / "run", tmp_path / "whole")
 
 
 def test_running_statistics_of_batch_norms_are_resumed_too(

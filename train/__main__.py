@@ -292,8 +292,11 @@ def _fit_defaults(arguments: list[str]) -> FitConfig:
         return fit_config_from_json(saved.read_text(), where=str(saved))
     profile = given.get("--profile", "cpu")
     method = get_method(given.get("--system", "ours"))
+    variant = given.get("--variant", "standard")
+    # A variant is a model of the paper.
+    recipe = given.get("--recipe", method.recipes[0] if variant == "standard" else "paper")
     config = method.recipe(profile if profile in get_args(Profile) else "cpu")
-    return method.variant(config, given.get("--variant", "standard"))
+    return method.variant(method.with_recipe(config, recipe), variant)
 
 
 if __name__ == "__main__":

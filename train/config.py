@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 Profile = Literal["full", "cpu", "smoke"]
+Recipe = Literal["whole-shapes", "paper"]
 Variant = Literal["standard", "highly-diverse"]
 OutputHead = Literal["points", "latent"]
 Precision = Literal["float32", "bfloat16"]
@@ -120,6 +121,12 @@ class StageConfig(Schedule):
     """Weight of the gradient penalty in the critic's loss."""
     real_pool: int = 0
     """Ground truth clouds of other shapes that the critic sees, for each shape of the batch, beside its own."""
+    shape_weight: float = 0.0
+    """Weight of the whole-shape loss: of the predictions of an image, the nearest to the whole target cloud is trained.
+    0: the network learns from depth maps alone, as in the paper."""
+    shape_distance: Literal["emd", "chamfer", "both"] = "emd"
+    """Distance of the whole-shape loss (x100): the earth mover's compares how many points are where, chamfer does not;
+    "both" is their sum."""
     weight_decay: float = 0.0
     """Weight of |weights|^2 / 2 added to the loss; not used by the paper's own training."""
 
@@ -181,6 +188,9 @@ class FitConfig:
     profile: Profile = "cpu"
     """Size of the network: full 192 x 256 images and 2048 points, cpu 96 x 128 and 512, smoke 48 x 64 and
     128."""
+    recipe: Recipe = "paper"
+    """How the network is taught. "whole-shapes": by the data's target clouds too, of which every code may choose one
+    that fits the image. "paper": by the depth maps of the images alone."""
     variant: Variant = "standard"
     """The paper's main model, or its "highly diverse" one, whose predictions disagree more before search."""
     system: str = "ours"
@@ -188,6 +198,12 @@ class FitConfig:
     output_head: OutputHead = "points"
     """What the generator predicts: points (the released network), or a latent of the auto-encoder, whose frozen
     decoder makes the points (the network of the paper's text)."""
+    points_per_cell: int = 2
+    """Points that the generator predicts in each cell of its feature grid; the paper's network has 2. The numbers of
+    points above belong to 2, and grow in proportion."""
+    augmentation: float = 0.0
+    """Strength of random changes of light, colour, sharpness, noise, size and place of the training images; 0: none, 1:
+    as much as photographs need."""
     precision: Precision = "float32"
     """Number format of the generator during training. bfloat16: all layers but the last, about twice as fast where the
     processor can multiply such numbers (avx512_bf16, amx; see lscpu), slower elsewhere."""

@@ -28,6 +28,8 @@ class Procedural:
     """Side of the renders in pixels; 112 is enough for the cpu profile."""
     views: int = 8
     """Views per shape."""
+    variants: int = 1
+    """How many of an object's three backs become shapes of their own, with the same front, cameras and split."""
 
     def run(self) -> None:
         from train.data.procedural import generate
@@ -39,6 +41,7 @@ class Procedural:
             seed=self.seed,
             size=self.size,
             views=self.views,
+            variants=self.variants,
         )
         print(report.summary())
 
@@ -56,6 +59,8 @@ class Meshes:
     """Directory of the new data tree; running the command again finishes or extends it."""
     labels: Path | None = None
     """CSV file with the category of each mesh; meshes without a label are left out."""
+    unlabelled: bool = False
+    """Use the meshes without a label too; their category is that of a folder on the path, or "unknown"."""
     category: str | None = None
     """Category of all meshes; by default that of a folder on the path, by its name or its WordNet synset."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "y"
@@ -89,6 +94,7 @@ class Meshes:
             self.sources,
             self.out,
             labels=self.labels,
+            unlabelled=self.unlabelled,
             size=self.size,
             views=self.views,
             seed=self.seed,

@@ -73,15 +73,19 @@ class LoadedSplit:
 
     def batch(self, shapes: Tensor, views: Tensor) -> Batch:
         """(B,) shape and (B, V) view numbers -> a batch."""
-        picked = (shapes[:, None], views)
-        size = self.depth[0].shape[-1]
-        camera = PinholeCamera(self.K[picked], self.cam_from_world[picked], size, size)
-        return Batch(self.float_images(shapes, views), _picked(self.depth, shapes, views), camera)
+        depth, camera = self._depth_maps(shapes, views)
+        return Batch(self.float_images(shapes, views), depth, camera)
 
     def targets(self, shapes: Tensor) -> Targets:
         """(B,) shape numbers -> their whole surfaces and all of their views."""
-        seen = self.batch(shapes, torch.arange(self.views).expand(len(shapes), -1))
-        return Targets(self.points[shapes], seen.depth, seen.camera)
+        depth, camera = self._depth_maps(shapes, torch.arange(self.views).expand(len(shapes), -1))
+        return Targets(self.points[shapes], depth, camera)
+
+    def _depth_maps(self, shapes: Tensor, views: Tensor) -> tuple[Tensor, PinholeCamera]:
+        picked = (shapes[:, None], views)
+        size = self.depth[0].shape[-1]
+        camera = PinholeCamera(self.K[picked], self.cam_from_world[picked], size, size)
+        return _picked(self.depth, shapes, views), camera
 
     def clouds(self, shapes: Tensor, points: Tensor) -> Tensor:
         """(B,) shape and (B, N) point numbers -> (B, N, 3) of the ground truth."""

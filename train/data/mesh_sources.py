@@ -246,9 +246,11 @@ def _turn_of(text: str, where: str) -> Rotation | None:
 
 
 def keep_labelled(
-    meshes: Sequence[MeshFile], labels: Sequence[Label], path: str | Path
+    meshes: Sequence[MeshFile], labels: Sequence[Label], path: str | Path, *, others: bool = False
 ) -> tuple[list[MeshFile], dict[str, str]]:
     """The meshes that have a label, with its category; and reasons by the name of labelled ones that do not exist.
+
+    With `others`, the meshes without a label follow, with the category that they have.
 
     Raises:
         UserError: no label fits any mesh.
@@ -279,6 +281,9 @@ def keep_labelled(
         raise UserError(
             f"no line of {path} fits the meshes: its libraries are {named}, the sources are {given}"
         )
+    if others:
+        labelled = {mesh.name for mesh in kept}
+        kept += [mesh for mesh in meshes if mesh.name not in labelled]
     return kept, absent
 
 

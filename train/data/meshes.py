@@ -135,6 +135,7 @@ def convert(
     out: str | Path,
     *,
     labels: str | Path | None = None,
+    unlabelled: bool = False,
     size: int = 224,
     views: int = 8,
     seed: int = 0,
@@ -148,6 +149,7 @@ def convert(
         out: folder of the dataset.
         labels: CSV with the columns library, model, category, synset; only the meshes it names are made. Without
             one, the category is that of a folder on the path (a name of the paper's or a synset), or "unknown".
+        unlabelled: make the meshes without a label too, as if there were no label file.
         size: pixels of a side of each view.
         views: per mesh.
         seed: of cameras, samples and split.
@@ -164,6 +166,10 @@ def convert(
     tree_files.require_between(size=(size, 16, 2048), views=(views, 1, 256))
     if labels is not None and options.category is not None:
         raise UserError("labels and category both set the category of the meshes; give one of them")
+    if unlabelled and labels is None:
+        raise UserError(
+            "unlabelled says what happens to meshes that a label file does not name; give labels too"
+        )
     options.check()
     wanted = None if labels is None else read_labels(labels)
     with tempfile.TemporaryDirectory(prefix="meshes-") as scratch:
@@ -171,7 +177,7 @@ def convert(
         if not meshes:
             raise UserError(f"no meshes in {', '.join(map(str, sources)) or 'no sources'}")
         if wanted is not None and labels is not None:
-            meshes, absent = keep_labelled(meshes, wanted, labels)
+            meshes, absent = keep_labelled(meshes, wanted, labels, others=unlabelled)
             failures |= absent
         if options.category is not None:
             meshes = of_category(meshes, options.category)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from train.errors import UserError
 
 if TYPE_CHECKING:
-    from train.config import FitConfig
+    from train.config import FitConfig, Recipe
     from train.methods.base import Method
 
 
@@ -49,6 +49,7 @@ def get_method(name: str) -> Method:
     return getattr(importlib.import_module(f"train.methods.{module}"), kind)(name)
 
 
-def recipe(name: str, profile: str) -> FitConfig:
+def recipe(name: str, profile: str, recipe: Recipe = "paper") -> FitConfig:
     """How a method is trained at a profile ("full", "cpu", "smoke")."""
-    return get_method(name).recipe(profile)
+    method = get_method(name)
+    return method.with_recipe(method.recipe(profile), recipe)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from models import Autoencoder, Critic, Predictor
-from train.config import FitConfig, InferenceConfig, StageConfig
+from train.config import FitConfig, InferenceConfig, Recipe, StageConfig
 from train.data.batches import Targets
 from train.distributed import SINGLE, World
 from train.errors import UserError
@@ -77,7 +77,7 @@ class Method(ABC):
         sizes: profile -> configuration of the network.
         network_class: class of the network; built from one of `sizes`.
         weights_key: name of that class in the header of weights files.
-        uses_targets: do the losses need more than the views of the batch, that is, `Batch.targets`?
+        recipes: names of its recipes; the first one is the default of `fit`.
         needs_whole_batch: why several processes cannot share a batch; empty if they can.
     """
 
@@ -85,7 +85,7 @@ class Method(ABC):
     sizes: ClassVar[Mapping[str, Any]]
     network_class: ClassVar[type[Predictor]]
     weights_key: ClassVar[str]
-    uses_targets: ClassVar[bool] = True
+    recipes: ClassVar[tuple[Recipe, ...]] = ("paper",)
     needs_whole_batch: ClassVar[str] = ""
 
     def __init__(self, name: str) -> None:
@@ -93,11 +93,16 @@ class Method(ABC):
 
     @abstractmethod
     def recipe(self, profile: str) -> FitConfig:
-        """The configuration of a training with the profile "full", "cpu" or "smoke"."""
+        """The configuration of a training with the profile "full", "cpu" or "smoke", as its paper has it."""
 
     @abstractmethod
     def build(self, config: FitConfig) -> Predictor:
         """The network of a configuration, with freshly drawn weights."""
+
+    def needs_targets(self, phase: StageConfig) -> bool:
+        """Do the losses of a phase need more than the views of the batch, that is, `Batch.targets`?"""
+        del phase
+        return True
 
     def oracle(self, network: Predictor, targets: Targets) -> Tensor | None:
         """What the network would predict if it had learnt its targets without error: the best of its representation.
@@ -124,6 +129,10 @@ class Method(ABC):
         """The recipe to assume for a network that comes without the configuration of its training."""
         return self.recipe(network.profile)
 
+    def with_recipe(self, config: FitConfig, name: str) -> FitConfig:
+        """The paper's recipe changed to another one of `recipes`."""
+        return config
+
     def variant(self, config: FitConfig, name: str) -> FitConfig:
         """A recipe changed to one of the method's variants; `check` refuses the names that a method does not have."""
         return config
@@ -135,6 +144,8 @@ class Method(ABC):
             UserError: names the settings and says how to mend them.
         """
         name = f"--system {self.name}"
+        if config.recipe not in self.recipes:
+            raise UserError(f"{name} has no recipe {config.recipe}; leave --recipe at {self.recipes[0]}")
         if any((stage.supervision, stage.visibility) != ("front", "zbuffer") for stage in config.stages):
             raise UserError(
                 f"{name} has a loss of its own; do not set --stage*.supervision or --stage*.visibility"
@@ -143,6 +154,10 @@ class Method(ABC):
             raise UserError(
                 f"{name} does not support a critic, the latent output head, the deterministic counterpart or variants; "
                 "do not set --output-head, --deterministic, --variant or --stage*.gamma"
+            )
+        if (config.points_per_cell, *(stage.shape_weight for stage in config.stages)) != (2, 0, 0):
+            raise UserError(
+                f"{name} has a network and a loss of its own; do not set --points-per-cell or --stage*.shape-weight"
             )
         if config.precision != "float32":
             raise UserError(f"{name} computes in float32; do not set --precision")

@@ -6,7 +6,7 @@ Start reading at `generator_loss`: its last sum is the paper's loss.
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -39,7 +39,13 @@ from train.methods.base import (
     check_finite,
     set_learning_rate,
 )
-from train.methods.losses import diversity_term, view_loss
+from train.methods.losses import (
+    diversity_term,
+    for_each_image,
+    nearest_prediction_loss,
+    targets_of,
+    view_loss,
+)
 
 
 def generator_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) -> dict[str, Tensor]:
@@ -71,6 +77,13 @@ def generator_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) ->
         diversity = diversity_term(noise.codes, clouds, stage, views=views, step=step.number)
     timer.mark("distances")
 
+    # Of the predictions of an image, the nearest to the whole shape: each code may choose another shape.
+    shape, shape_statistics = torch.zeros(()), {}
+    if stage.shape_weight > 0:
+        targets = for_each_image(targets_of(batch).points, batch)
+        shape, shape_statistics = nearest_prediction_loss(clouds, targets, stage, step=step.number)
+        timer.mark("distances")
+
     # The critic learns to tell the latents of predictions from those of real shapes; then it judges the predictions.
     critic, critic_statistics = torch.zeros(()), {}
     if stage.gamma > 0:
@@ -81,10 +94,11 @@ def generator_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) ->
         critic = critic_term(state.critic(fake))
         timer.mark("critic")
 
-    # The paper's sum.
-    loss = front.loss + beta * diversity + stage.gamma * critic
+    # The paper's sum, and the whole shape's term.
+    loss = front.loss + beta * diversity + stage.gamma * critic + stage.shape_weight * shape
     return {
-        "loss": loss, "front": front.loss, "diversity": diversity, **critic_statistics, **front.statistics,
+        "loss": loss, "front": front.loss, "diversity": diversity,
+        **critic_statistics, **front.statistics, **shape_statistics,
     }  # fmt: skip
 
 
@@ -150,10 +164,16 @@ class Ours(Method):
     sizes = SIZES
     network_class = Generator
     weights_key = "generator"
-    uses_targets = False
+    recipes = ("whole-shapes", "paper")
 
     def recipe(self, profile: str) -> FitConfig:
         return PROFILES[profile]
+
+    def with_recipe(self, config: FitConfig, name: str) -> FitConfig:
+        return whole_shapes(config) if name == "whole-shapes" else config
+
+    def needs_targets(self, phase: StageConfig) -> bool:
+        return phase.shape_weight > 0
 
     def variant(self, config: FitConfig, name: str) -> FitConfig:
         return highly_diverse(config) if name == "highly-diverse" else config
@@ -164,6 +184,7 @@ class Ours(Method):
             deterministic=config.deterministic,
             output_head=config.output_head,
             occupancy_logits=config.occupancy_logits,
+            points_per_cell=config.points_per_cell,
         )
 
     def build(self, config: FitConfig) -> Generator:
@@ -242,6 +263,30 @@ PROFILES = {
     "cpu": FitConfig(_CPU_STAGE1, _CPU_STAGE2, _CPU_PRETRAIN, **RUN_SETTINGS["cpu"]),
     "smoke": FitConfig(_SMOKE_STAGE1, _SMOKE_STAGE2, _SMOKE_PRETRAIN, **RUN_SETTINGS["smoke"]),
 }
+
+
+def whole_shapes(config: FitConfig) -> FitConfig:
+    """The paper's recipe changed to learn from whole shapes, where the data hold them.
+
+    Every code's prediction must still satisfy the front constraint; of an image's predictions the nearest to the shape
+    is trained on the whole of it (conditional implicit maximum likelihood estimation). No prediction is pushed to be
+    different for its own sake: the diversity loss and the critic are off.
+
+    Source: Li et al., "Multimodal image synthesis with conditional implicit maximum likelihood estimation" (IJCV 2020).
+    """
+
+    def stage(stage: StageConfig, **settings: Any) -> StageConfig:
+        settings = {"front": "chamfer", "beta": 0.0, "gamma": 0.0, "shape_weight": 2.0} | settings
+        return dataclasses.replace(stage, **settings)
+
+    return dataclasses.replace(
+        config,
+        recipe="whole-shapes",
+        points_per_cell=4,
+        augmentation=1.0,
+        stage1=stage(config.stage1, codes=min(5, config.stage1.codes + 2)),
+        stage2=stage(config.stage2, codes=min(5, config.stage2.codes + 1)),
+    )
 
 
 def highly_diverse(config: FitConfig) -> FitConfig:

@@ -29,7 +29,7 @@ def whole_cloud_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) 
     """PSGN: each image's prediction against the whole target cloud."""
     clouds = state.network(batch.images.flatten(0, 1), noise.codes[:1])
     targets = for_each_image(targets_of(batch).points, batch)
-    return {"loss": cloud_distances(clouds, targets, step.phase, step=step.number).mean()}
+    return {"loss": cloud_distances(clouds, targets, step.phase.front, step=step.number).mean()}
 
 
 def best_cloud_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) -> dict[str, Tensor]:
@@ -37,7 +37,7 @@ def best_cloud_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) -
     targets = for_each_image(targets_of(batch).points, batch)
 
     def distances(clouds: Tensor, tolerance: float) -> Tensor:
-        return cloud_distances(clouds, targets, step.phase, step=step.number, tolerance=tolerance)
+        return cloud_distances(clouds, targets, step.phase.front, step=step.number, tolerance=tolerance)
 
     return best_of_n(state.network, batch, noise, distances)
 

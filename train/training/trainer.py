@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from train.config import FitConfig, PretrainConfig, StageConfig, fit_config_from_json, to_json
+from train.data.augment import augment
 from train.data.batches import Batch, LoadedSplit, Sampler
 from train.data.layouts import require_depth
 from train.distributed import SINGLE, World, connect
@@ -257,7 +258,10 @@ class Trainer:
             mix = torch.rand(phase.n_critic, phase.codes, images, generator=self._random)
             real = [self._clouds(shapes), *(self._draw_clouds(phase.shapes) for _ in range(phase.real_pool))]
             batch = batch._replace(real=shard(torch.stack(real), 1))
-        if self.method.uses_targets:
+        if self.config.augmentation > 0:
+            changed = augment(batch.images.flatten(0, 1), self.config.augmentation, self._random)
+            batch = batch._replace(images=changed.view(batch.images.shape))
+        if self.method.needs_targets(phase):
             batch = batch._replace(targets=self._train.targets(shard(shapes)))
         return batch, Noise(shard(codes, 1), shard(mix, -1))
 
@@ -401,8 +405,8 @@ def _means(report: Mapping[str, Tensor], world: World) -> dict[str, float]:
 
 def _bar_values(record: Mapping[str, Any]) -> dict[str, str]:
     names = {
-        "cd": "cd", "front": "front", "matched_share": "matched", "diversity": "div", "critic_loss": "critic",
-        "image_sensitivity": "image", "code_sensitivity": "code",
+        "cd": "cd", "front": "front", "shape": "shape", "matched_share": "matched", "diversity": "div",
+        "critic_loss": "critic", "image_sensitivity": "image", "code_sensitivity": "code",
     }  # fmt: skip
     shown = {short: f"{record[name]:.2f}" for name, short in names.items() if name in record}
     return shown | {"wait": f"{record['data_wait_share']:.0%}"}

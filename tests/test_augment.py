@@ -1,0 +1,55 @@
+"""Random changes of training images: what they may change, and what must stay."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from train.data.augment import augment
+from train.data.batches import load_split
+
+
+@pytest.fixture(scope="module")
+def images(tiny_data: Path) -> torch.Tensor:
+    split = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, progress=False)
+    shapes = torch.arange(min(8, len(split)))
+    return split.float_images(shapes, torch.zeros(len(shapes), 1, dtype=torch.long))[:, 0]
+
+
+def _changed(images: torch.Tensor, strength: float, seed: int = 0) -> torch.Tensor:
+    return augment(images, strength, torch.Generator().manual_seed(seed))
+
+
+def test_without_strength_an_image_stays_what_it_was(images: torch.Tensor) -> None:
+    # Pixels whiter than 0.98 become white.
+    assert (_changed(images, 0.0) - images).abs().max() < 0.021
+
+
+def test_changes_follow_the_generator_and_their_strength(images: torch.Tensor) -> None:
+    changed = _changed(images, 1.0)
+    assert torch.equal(changed, _changed(images, 1.0))
+    assert not torch.equal(changed, _changed(images, 1.0, seed=1))
+    assert changed.shape == images.shape
+    assert 0 <= changed.min() <= changed.max() <= 1
+    slight = (_changed(images, 0.1) - images).abs().mean()
+    assert 0 < slight < (changed - images).abs().mean() / 2
+
+
+def test_every_image_is_changed_in_its_own_way_and_shows_its_object_still(images: torch.Tensor) -> None:
+    same = images[:1].expand(6, -1, -1, -1)
+    changed = torch.cat([_changed(same, 1.0, seed) for seed in range(4)])
+    apart = torch.cdist(changed.flatten(1), changed.flatten(1))
+    assert apart[~torch.eye(len(changed), dtype=torch.bool)].min() > 0.5
+    was_object, is_object = (each.amin(1) < 0.7 for each in (images[:1], changed))
+    overlap = (was_object & is_object).sum((1, 2)) / (was_object | is_object).sum((1, 2))
+    assert overlap.min() > 0.5
+
+
+def test_white_comes_in_from_outside_where_the_object_moves(images: torch.Tensor) -> None:
+    dark = torch.zeros_like(images)
+    moved = torch.cat([_changed(dark, 1.0, seed) for seed in range(8)])
+    assert (moved[:, :, 0, 0] > 0.5).any(), "no corner was moved into the picture"
+    middle = moved[:, :, 20:28, 28:36]
+    assert middle.mean() < 0.1, "the object in the middle should have stayed dark"
