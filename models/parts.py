@@ -36,11 +36,12 @@ def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Con
     return nn.Conv2d(inputs, outputs, kernel, stride, padding=(kernel - 1) // 2)
 
 
-def _conv_relu(inputs: int, *layers: tuple[int, int, int]) -> nn.Sequential:
-    """A chain of convolution + ReLU; each layer is (channels, kernel, stride)."""
+def _conv_relu(config: GeneratorConfig, inputs: int, *layers: tuple[int, int, int]) -> nn.Sequential:
+    """A chain of convolution, group norm if the network has it, and ReLU; each layer is (channels, kernel, stride)."""
     modules: list[nn.Module] = []
     for outputs, kernel, stride in layers:
-        modules += [_conv(inputs, outputs, kernel, stride), nn.ReLU()]
+        norm = [nn.GroupNorm(math.gcd(outputs, max(1, outputs // 8)), outputs)] if config.group_norm else []
+        modules += [_conv(inputs, outputs, kernel, stride), *norm, nn.ReLU()]
         inputs = outputs
     return nn.Sequential(*modules)
 
@@ -49,6 +50,7 @@ def image_trunk(config: GeneratorConfig) -> nn.Sequential:
     """(B, 3, H, W) -> (B, C, H/8, W/8)."""
     c16, c32, c64, c128 = (_widen(c, config.trunk_width) for c in (16, 32, 64, 128))
     return _conv_relu(
+        config,
         3,
         *((c16, 3, 1), (c16, 3, 1), (c32, 3, 2)),
         *((c32, 3, 1), (c32, 3, 1), (c64, 3, 2)),
@@ -68,7 +70,7 @@ class CodeBranch(nn.Module):
         )
         self.grid = config.grid
         outputs = _widen(128, config.trunk_width)
-        self.convs = _conv_relu(3, (_widen(32, config.trunk_width), 3, 1), (outputs, 3, 1))
+        self.convs = _conv_relu(config, 3, (_widen(32, config.trunk_width), 3, 1), (outputs, 3, 1))
 
     def forward(self, codes: Tensor) -> Tensor:
         return self.convs(self.spread(codes).unflatten(1, (3, *self.grid)))
@@ -80,9 +82,9 @@ class _Contraction(nn.Module):
     def __init__(self, config: GeneratorConfig) -> None:
         super().__init__()
         c256, c512 = (_widen(c, config.decoder_width) for c in (256, 512))
-        self.down4 = _conv_relu(_joined_channels(config), (c256, 3, 2), (c256, 3, 1), (c256, 3, 1))
-        self.down5 = _conv_relu(c256, (c512, 3, 2), (c512, 3, 1), (c512, 3, 1), (c512, 3, 1))
-        self.bottleneck = _conv_relu(c512, (c512, 5, 2))
+        self.down4 = _conv_relu(config, _joined_channels(config), (c256, 3, 2), (c256, 3, 1), (c256, 3, 1))
+        self.down5 = _conv_relu(config, c256, (c512, 3, 2), (c512, 3, 1), (c512, 3, 1), (c512, 3, 1))
+        self.bottleneck = _conv_relu(config, c512, (c512, 5, 2))
 
         rows, columns = (math.ceil(side / 8) for side in config.grid)
         hidden = _widen(2048, config.decoder_width), _widen(1024, config.decoder_width)
@@ -123,11 +125,11 @@ class PointDecoder(_Contraction):
         self.fc_points = nn.Linear(self.fc_width, self.values * config.fc_points)
 
         self.up5, self.skip5 = _deconv(c512, c256), _conv(c512, c256)
-        self.merge5 = _conv_relu(c256, (c256, 3, 1))
+        self.merge5 = _conv_relu(config, c256, (c256, 3, 1))
         self.up4, self.skip4 = _deconv(c256, c128), _conv(c256, c128)
-        self.merge4 = _conv_relu(c128, (c128, 3, 1))
+        self.merge4 = _conv_relu(config, c128, (c128, 3, 1))
         self.up3, self.skip3 = _deconv(c128, c64), _conv(joined, c64)
-        self.merge3 = _conv_relu(c64, (c64, 3, 1), (c64, 3, 1))
+        self.merge3 = _conv_relu(config, c64, (c64, 3, 1), (c64, 3, 1))
         self.conv_points = _conv(c64, config.points_per_cell * self.values)
 
     def forward(self, joined: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ class GeneratorConfig:
             "latent": the network predicts a latent code of the auto-encoder of shapes, whose frozen decoder, set by
             `adopt_decoder`, computes the points (the network of the paper's text).
         occupancy_logits: also predict an occupancy logit for every point, for losses that may delete points.
+        group_norm: normalise the channels of an image in groups of eight before each ReLU; the paper has no such layer.
         points_per_cell: points that the convolutional branch predicts in each grid cell; the paper's has two.
     """
 
@@ -36,6 +37,7 @@ class GeneratorConfig:
     deterministic: bool = False
     output_head: OutputHead = "points"
     occupancy_logits: bool = False
+    group_norm: bool = False
     points_per_cell: int = 2
 
     def __post_init__(self) -> None:

@@ -289,6 +289,21 @@ def test_only_the_prediction_nearest_to_the_whole_shape_is_trained_on_it() -> No
     assert again == loss != later
 
 
+def test_a_relaxed_loss_pulls_the_other_predictions_a_little() -> None:
+    stage = dataclasses.replace(_OURS["cpu"].stage1, shape_weight=1.0, shape_relaxation=0.25)
+    clouds = _flat_clouds(offset=0.01)[:, :1].requires_grad_()
+    loss, statistics = nearest_prediction_loss(clouds, _flat_clouds()[0, :1], stage, step=0)
+    strict, _ = nearest_prediction_loss(
+        clouds, _flat_clouds()[0, :1], dataclasses.replace(stage, shape_relaxation=0.0), step=0
+    )
+    expected = 0.75 * strict + 0.25 * statistics["mean_emd"]
+    torch.testing.assert_close(loss, expected)
+    (gradient,) = torch.autograd.grad(loss, clouds)
+    nearest, other = gradient[:, 0].sum(1)[:, 2]
+    assert other == pytest.approx(0.25 * 100 / 2, rel=0.02)  # nearly straight towards depth 0
+    assert nearest > 0
+
+
 def test_the_whole_shape_loss_is_of_the_distance_that_was_asked_for() -> None:
     clouds, targets = _flat_clouds(offset=0.02)[:1], _flat_clouds()[0]
     stage = dataclasses.replace(_OURS["cpu"].stage1, shape_weight=1.0)

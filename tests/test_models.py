@@ -231,6 +231,17 @@ def test_sizes_of_ones_own() -> None:
     assert clouds.shape[2] == model.points == 128 + 42
 
 
+def test_group_norms_treat_each_image_and_code_by_itself() -> None:
+    model = build_generator(config=dataclasses.replace(PROFILES["smoke"], group_norm=True))
+    images, codes = torch.rand(3, 3, 48, 64), torch.randn(2, 3, CODE_DIM)
+    together = model(images, codes)
+    alone = torch.cat([model(images[i : i + 1], codes[:, i : i + 1]) for i in range(3)], 1)
+    torch.testing.assert_close(together, alone, atol=1e-6, rtol=1e-4)
+    brighter = torch.cat([images[:1], images[1:] / 2])
+    torch.testing.assert_close(model(brighter, codes)[:, 0], together[:, 0], atol=1e-6, rtol=1e-4)
+    assert sum(isinstance(part, torch.nn.GroupNorm) for part in model.modules()) > 20
+
+
 def test_more_points_in_each_cell_are_more_points_of_both_branches() -> None:
     model = build_generator(config=dataclasses.replace(PROFILES["smoke"], points_per_cell=4))
     clouds = model(torch.rand(1, 3, 48, 64), torch.randn(2, 1, CODE_DIM))

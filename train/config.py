@@ -127,6 +127,9 @@ class StageConfig(Schedule):
     shape_distance: Literal["emd", "chamfer", "both"] = "emd"
     """Distance of the whole-shape loss (x100): the earth mover's compares how many points are where, chamfer does not;
     "both" is their sum."""
+    shape_relaxation: float = 0.0
+    """Share of the whole-shape loss that goes to all predictions instead of the nearest: a code whose prediction is far
+    from every shape, and so never the nearest, is pulled towards them."""
     weight_decay: float = 0.0
     """Weight of |weights|^2 / 2 added to the loss; not used by the paper's own training."""
 
@@ -201,6 +204,8 @@ class FitConfig:
     points_per_cell: int = 2
     """Points that the generator predicts in each cell of its feature grid; the paper's network has 2. The numbers of
     points above belong to 2, and grow in proportion."""
+    group_norm: bool = False
+    """Group normalisation in the generator; the paper's network has none."""
     augmentation: float = 0.0
     """Strength of random changes of light, colour, sharpness, noise, size and place of the training images; 0: none, 1:
     as much as photographs need."""

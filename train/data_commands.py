@@ -30,6 +30,8 @@ class Procedural:
     """Views per shape."""
     variants: int = 1
     """How many of an object's three backs become shapes of their own, with the same front, cameras and split."""
+    fronts: int = 0
+    """How many of the views show the front that hides the backs; random views seldom do."""
 
     def run(self) -> None:
         from train.data.procedural import generate
@@ -42,6 +44,7 @@ class Procedural:
             size=self.size,
             views=self.views,
             variants=self.variants,
+            fronts=self.fronts,
         )
         print(report.summary())
 

@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy.spatial import KDTree
 
+from diffpoint.camera import PinholeCamera
 from train.data import tree_files
 from train.data.categories import SYNSET_OF
 from train.data.families import FAMILIES, MODES, Cone
@@ -82,6 +84,7 @@ class _Job:
     size: int
     views: int
     variants: int
+    fronts: int
 
     def shape(self, mode: int) -> str:
         return f"{SYNSET_OF[self.category]}/{self.category}_s{self.seed}_{self.index:06d}_h{mode}"
@@ -163,6 +166,7 @@ def generate(
     views: int = 8,
     processes: int | None = None,
     variants: int = 1,
+    fronts: int = 0,
 ) -> ProceduralReport:
     """Makes a data tree of procedural objects; running it again finishes or extends it.
 
@@ -176,6 +180,8 @@ def generate(
         processes: None for one per core.
         variants: hidden variants written for each object, 1 to 3, with the same cameras and in the same split;
             families without designed ambiguity have one.
+        fronts: how many of the views show the front that hides the variants (random views are within the cone of front
+            views in one case of thirty); families without designed ambiguity have random views only.
 
     Raises:
         UserError: an unknown category, a number out of range, or a folder that holds something else.
@@ -188,7 +194,11 @@ def generate(
             f"no procedural family {', '.join(unknown) or '(none given)'}; there are: {', '.join(FAMILIES)}"
         )
     tree_files.require_between(
-        shapes=(shapes, 1, 10**6), size=(size, 16, 2048), views=(views, 1, 256), variants=(variants, 1, MODES)
+        shapes=(shapes, 1, 10**6),
+        size=(size, 16, 2048),
+        views=(views, 1, 256),
+        variants=(variants, 1, MODES),
+        fronts=(fronts, 0, views),
     )
     if seed < 0:
         raise UserError(f"seed must not be negative; got {seed}")
@@ -200,8 +210,10 @@ def generate(
         "variants": variants,
         "categories": list(names),
     }
+    if fronts:  # trees of earlier versions have no such setting
+        settings["fronts"] = fronts
     tree_files.prepare_output(out, settings)
-    jobs = [_Job(out, names[i % len(names)], i, seed, size, views, variants) for i in range(shapes)]
+    jobs = [_Job(out, names[i % len(names)], i, seed, size, views, variants, fronts) for i in range(shapes)]
     made, failures = 0, {}
     for job, result in map_unordered(
         _make, jobs, processes=processes, title="procedural shapes", unit="shape"
@@ -224,7 +236,7 @@ def _make(job: _Job) -> int | Exception:
         return 0
     try:
         solids_of_mode = variants_of(job.category, entropy)
-        camera = draw_camera(np.random.default_rng([*entropy, 2]), job.views, job.size)
+        camera = _draw_views(np.random.default_rng([*entropy, 2]), job)
         for mode in missing:
             solids = solids_of_mode[mode]
             points = sample_union(solids, tree_files.POINTS, np.random.default_rng([*entropy, 3, mode]))
@@ -234,6 +246,18 @@ def _make(job: _Job) -> int | Exception:
     except (RuntimeError, OSError) as error:
         return error
     return len(missing)
+
+
+def _draw_views(rng: np.random.Generator, job: _Job) -> PinholeCamera:
+    """The cameras of an object: some of its front, the others all around it."""
+    cone = FAMILIES[job.category].cone
+    fronts = job.fronts if cone else 0
+    cameras = [draw_camera(rng, job.views - fronts, job.size)] if fronts < job.views else []
+    if cone and fronts:
+        azimuth = rng.uniform(-cone.azimuth_deg, cone.azimuth_deg, fronts)
+        cameras.insert(0, orbit_camera(azimuth, np.full(fronts, cone.elevation_deg), job.size))
+    K, pose = (torch.cat([getattr(c, name) for c in cameras]) for name in ("K", "cam_from_world"))
+    return PinholeCamera(K, pose, job.size, job.size)
 
 
 def _radius(variants: Sequence[list[Solid]]) -> float:

@@ -21,7 +21,6 @@ from train.config import FitConfig
 from train.data.cutout import cut_out
 from train.data.images import is_cut_out, read_rgba
 from train.data.photos import Photo, find_photos
-from train.data.render import orbit_camera
 from train.errors import UserError
 from train.evaluation.inference import reconstruct
 from train.evaluation.reconstruct import MOST_IMAGES, read_pictures
@@ -35,7 +34,6 @@ from train.show.tables import markdown_lines
 
 OBJECTS = 8
 CODES = 3
-_SHOWN_PICTURES = 3
 _STEPS = ("random", "searched", "agreed")
 _USE = (
     "--pictures names a folder with a folder of pictures for each object, each alone on plain or white ground; to look "
@@ -161,32 +159,21 @@ def markdown(result: Mapping[str, Any]) -> str:
 def _figure(
     result: Mapping[str, Any], objects: Sequence[PhotographedObject], found: Sequence[Metrics]
 ) -> Figure:
-    """A row for each object. Its cameras are not known: clouds are seen from the network's own front."""
-    most = max(len(each.pictures) for each in objects)
-    shown = min(most, _SHOWN_PICTURES)
-    figure, panels = figures.grid(rows=len(objects), columns=shown + CODES + 2)
-    sides = orbit_camera(np.array([30.0, 210.0]), np.array([20.0, 20.0]), 128).to(dtype=torch.float32)
-    for line, each, made in zip(panels, objects, found, strict=True):
-        for axes in line[:shown]:
-            figures.bare(axes)
-        for axes, picture in zip(line, each.pictures[:shown], strict=False):
-            figures.draw_image(axes, picture)
+    rows = []
+    for each, made in zip(objects, found, strict=True):
         count = len(each.pictures)
-        figures.caption(line[0], f"{each.name}, {count} picture{'s' if count > 1 else ''}")
-        front, behind = figures.narrowed(sides, torch.cat([made["agreed"], made["one"].flatten(0, 1)]))
-        clouds = [
-            *((cloud, front) for cloud in made["one"]),
-            (made["agreed"], front),
-            (made["agreed"], behind),
-        ]
-        for axes, (cloud, camera) in zip(line[shown:], clouds, strict=True):
-            figures.draw_cloud(axes, cloud, camera)
-        if count > 1:
-            before, _, after = made["losses"].tolist()
-            figures.caption(line[-2], f"disagreement {before:.2f} to {after:.2f}")
-    codes = [f"from the first, code {number + 1}" for number in range(CODES)]
-    figures.titles(panels, ["pictures", *[""] * (shown - 1), *codes, "from all pictures", "from behind"])
+        before, _, after = made["losses"].tolist()
+        rows.append(
+            figures.Photographed(
+                f"{each.name}, {count} picture{'s' if count > 1 else ''}",
+                each.pictures,
+                made["one"],
+                made["agreed"],
+                f"disagreement {before:.2f} to {after:.2f}" if count > 1 else "",
+            )
+        )
+    figure = figures.photographs_figure(rows)
     title = f"Photographs, profile {result['profile']}, seed 0"
     words = "; disagreement of the pictures' predictions (chamfer x100) with random and with agreed codes"
-    figures.headline(figure, title + words if most > 1 else title)
+    figures.headline(figure, title + words if any(row.remark for row in rows) else title)
     return figure

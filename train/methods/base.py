@@ -155,9 +155,10 @@ class Method(ABC):
                 f"{name} does not support a critic, the latent output head, the deterministic counterpart or variants; "
                 "do not set --output-head, --deterministic, --variant or --stage*.gamma"
             )
-        if (config.points_per_cell, *(stage.shape_weight for stage in config.stages)) != (2, 0, 0):
+        if config.points_per_cell != 2 or config.group_norm or any(s.shape_weight for s in config.stages):
             raise UserError(
-                f"{name} has a network and a loss of its own; do not set --points-per-cell or --stage*.shape-weight"
+                f"{name} has a network and a loss of its own; do not set --points-per-cell, --group-norm or "
+                "--stage*.shape-weight"
             )
         if config.precision != "float32":
             raise UserError(f"{name} computes in float32; do not set --precision")

@@ -221,21 +221,24 @@ def nearest_prediction_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Conditional IMLE: of R predictions of an image, the distance (x100) of the nearest one to its whole shape.
 
-    The predictions that are not the nearest are left free, so that other codes can predict other shapes.
+    The predictions that are not the nearest are left free, so that other codes can predict other shapes, or nearly so
+    with `shape_relaxation`, which gives a share of the loss to all of them.
 
     Args:
         clouds: (R, B, N, 3) predictions.
         targets: (B, P, 3) the images' shapes, points on the whole surface.
-        stage: `shape_distance`. The earth mover's distance, by which the nearest is found in any case, is of a random
-            part of the prediction and of points spread evenly over the target. Unlike chamfer it counts points: a
-            prediction that puts a few of its points on each of several possible backs is far from all of them.
+        stage: `shape_distance` and `shape_relaxation`. The earth mover's distance, by which the nearest is found in any
+            case, is of a random part of the prediction and of points spread evenly over the target. Unlike chamfer it
+            counts points: a prediction that puts a few of its points on each of several possible backs is far from all
+            of them.
         step: draws the points that take part.
 
     Returns:
         The mean over the images, and statistics for the log: the mean over all predictions of the distance by which the
         nearest was found, and over the nearest alone.
 
-    Source: Li et al., "Multimodal image synthesis with conditional implicit maximum likelihood estimation" (IJCV 2020).
+    Sources: Li et al., "Multimodal image synthesis with conditional implicit maximum likelihood estimation" (IJCV
+    2020); Rupprecht et al., "Learning in an uncertain world" (ICCV 2017) for the relaxation.
     """
     count = min(_TRANSPORT_POINTS, clouds.shape[2], targets.shape[1])
     random = torch.Generator().manual_seed(step)
@@ -244,13 +247,12 @@ def nearest_prediction_loss(
     evenly = farthest_point_sample(targets, count, start=start)  # its first points are spread evenly, too
     spread = torch.take_along_dim(targets, evenly[..., None], 1)
 
-    with torch.no_grad():
-        few = min(_SELECTION_POINTS, count)
-        coarse = spread[:, :few].expand(len(clouds), -1, few, 3).contiguous()
-        distances = earth_mover_distance(
-            clouds[:, :, some[:few]].contiguous(), coarse, tolerance=_SELECTION_TOLERANCE
-        ).cost
-        best = distances.argmin(0)
+    few = min(_SELECTION_POINTS, count)
+    coarse = spread[:, :few].expand(len(clouds), -1, few, 3).contiguous()
+    distances = earth_mover_distance(
+        clouds[:, :, some[:few]].contiguous(), coarse, tolerance=_SELECTION_TOLERANCE
+    ).cost
+    best = distances.detach().argmin(0)
     nearest = clouds[best, torch.arange(len(best), device=best.device)]
 
     loss = torch.zeros((), device=clouds.device)
@@ -259,10 +261,12 @@ def nearest_prediction_loss(
         loss = loss + 100 * transport.cost.mean()
     if stage.shape_distance in ("chamfer", "both"):
         loss = loss + cloud_distances(nearest[None], targets, "chamfer", step=step).mean()
+    if stage.shape_relaxation:
+        loss = torch.lerp(loss, 100 * distances.mean(), stage.shape_relaxation)
     return loss, {
-        "shape": loss,
-        "nearest_emd": 100 * distances.amin(0).mean(),
-        "mean_emd": 100 * distances.mean(),
+        "shape": loss.detach(),
+        "nearest_emd": 100 * distances.detach().amin(0).mean(),
+        "mean_emd": 100 * distances.detach().mean(),
     }
 
 

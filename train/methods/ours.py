@@ -185,6 +185,7 @@ class Ours(Method):
             output_head=config.output_head,
             occupancy_logits=config.occupancy_logits,
             points_per_cell=config.points_per_cell,
+            group_norm=config.group_norm,
         )
 
     def build(self, config: FitConfig) -> Generator:
@@ -272,17 +273,25 @@ def whole_shapes(config: FitConfig) -> FitConfig:
     is trained on the whole of it (conditional implicit maximum likelihood estimation). No prediction is pushed to be
     different for its own sake: the diversity loss and the critic are off.
 
-    Source: Li et al., "Multimodal image synthesis with conditional implicit maximum likelihood estimation" (IJCV 2020).
+    Sources: Li et al., "Multimodal image synthesis with conditional implicit maximum likelihood estimation" (IJCV
+    2020); relaxed as by Rupprecht et al., "Learning in an uncertain world" (ICCV 2017).
     """
 
     def stage(stage: StageConfig, **settings: Any) -> StageConfig:
-        settings = {"front": "chamfer", "beta": 0.0, "gamma": 0.0, "shape_weight": 2.0} | settings
+        settings = {
+            "front": "chamfer",
+            "beta": 0.0,
+            "gamma": 0.0,
+            "shape_weight": 2.0,
+            "shape_relaxation": 0.1,
+        } | settings
         return dataclasses.replace(stage, **settings)
 
     return dataclasses.replace(
         config,
         recipe="whole-shapes",
         points_per_cell=4,
+        group_norm=True,
         augmentation=1.0,
         stage1=stage(config.stage1, codes=min(5, config.stage1.codes + 2)),
         stage2=stage(config.stage2, codes=min(5, config.stage2.codes + 1)),

@@ -26,6 +26,7 @@ TRUE = LinearSegmentedColormap.from_list("true", ["#3d1f0c", "#a4562a", "#dd9f63
 MUTED = "#6b7785"
 _CELL_INCHES = 2.1
 _DEPTH_RANGE = 0.45  # world units before and behind the origin over which the colour changes
+_SHOWN_PICTURES = 3
 _INK = 17_000  # total area of a cloud's markers in a cell, in square typographic points
 
 
@@ -166,6 +167,55 @@ def overview_figure(examples: Sequence[Example]) -> Figure:
         _sides([upper[1], lower[1]])
     guesses = [f"from this image, code {i + 1}" for i in range(count)]
     titles(panels, ["one image / all images", *guesses, f"from all {views} images", "the true shape"])
+    return figure
+
+
+class Photographed(NamedTuple):
+    """An object in photographs, whose cameras and shape are not known."""
+
+    caption: str
+    pictures: Tensor
+    """(V, 3, H, W) in [0, 1]."""
+    predictions: Tensor
+    """(R, N, 3) from the first picture with R codes."""
+    reconstruction: Tensor
+    """(M, 3) from all pictures."""
+    remark: str = ""
+    """About the reconstruction."""
+
+
+def photographs_figure(objects: Sequence[Photographed]) -> Figure:
+    """A row for each object: some of its pictures, predictions from the first, and the reconstruction from all.
+
+    Clouds are seen from the network's own front, and the reconstruction from behind, too.
+    """
+    shown = min(max(len(each.pictures) for each in objects), _SHOWN_PICTURES)
+    count = len(objects[0].predictions)
+    figure, panels = grid(rows=len(objects), columns=shown + count + 2)
+    eye = torch.tensor([[0.94, 0.68, 1.63]])  # 30 degrees to the side, 20 up
+    front = PinholeCamera.look_at(eye, focal_px=240.0, height=128, width=128)
+    camera = PinholeCamera(
+        front.K.repeat(2, 1, 1),
+        torch.cat([front.cam_from_world, from_behind(front).cam_from_world]),
+        128,
+        128,
+    )
+    for line, each in zip(panels, objects, strict=True):
+        for axes in line[:shown]:
+            bare(axes)
+        for axes, picture in zip(line, each.pictures[:shown], strict=False):
+            draw_image(axes, picture)
+        caption(line[0], each.caption)
+        clouds = torch.cat([each.reconstruction, each.predictions.flatten(0, 1)])
+        ahead, behind = narrowed(camera, clouds)
+        for axes, cloud in zip(line[shown:], each.predictions, strict=False):
+            draw_cloud(axes, cloud, ahead)
+        for axes, side in zip(line[-2:], (ahead, behind), strict=True):
+            draw_cloud(axes, each.reconstruction, side)
+        if each.remark:
+            caption(line[-2], each.remark)
+    codes = [f"from the first, code {number + 1}" for number in range(count)]
+    titles(panels, ["pictures", *[""] * (shown - 1), *codes, "from all pictures", "from behind"])
     return figure
 
 
