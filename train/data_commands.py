@@ -51,7 +51,7 @@ class Procedural:
 
 @dataclasses.dataclass
 class Meshes:
-    """Render meshes into a data tree: OBJ, GLB, glTF, PLY, OFF or STL, from folders or archives.
+    """Render meshes into a data tree: OBJ, GLB, glTF, PLY, OFF, STL, AC3D or MD2, from folders or archives.
 
     Folders may be laid out as ShapeNetCore; archives are .zip files and .sh3f libraries of Sweet Home 3D.
     """

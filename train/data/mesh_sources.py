@@ -24,8 +24,8 @@ from train.files import DISK_ERRORS
 Rotation = tuple[float, ...]
 """9 numbers, row by row."""
 
-ARCHIVE_SUFFIXES = (".zip", ".sh3f")
-MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".off", ".stl")
+ARCHIVE_SUFFIXES = (".zip", ".sh3f", ".pk3")
+MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".off", ".stl", ".ac", ".acc", ".md2")
 _GENERAL_NAMES = {"model", "models", "model_normalized", "mesh", "meshes", "object"}
 _NOT_A_MODEL = re.compile(rf"(^|/)(\.|__MACOSX/|{CLOUDS}/)")
 """Hidden files, the resource forks in macOS archives, and the clouds of a dataset made below the source."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import glob
 import hashlib
 import io
 import tempfile
@@ -17,7 +18,7 @@ from trimesh.resolvers import FilePathResolver
 from trimesh.visual import ColorVisuals, TextureVisuals
 
 from diffpoint.camera import PinholeCamera
-from train.data import tree_files
+from train.data import game_meshes, tree_files
 from train.data.categories import category_of
 from train.data.mesh_sources import (
     UPRIGHT,
@@ -145,7 +146,7 @@ def convert(
     """Makes a data tree of meshes; running it again finishes or extends it.
 
     Args:
-        sources: folders, .zip and .sh3f archives, and mesh files (OBJ with its materials, GLB, PLY, OFF, STL).
+        sources: folders, .zip and .sh3f archives, and mesh files (a suffix of `MESH_SUFFIXES`).
         out: folder of the dataset.
         labels: CSV with the columns library, model, category, synset; only the meshes it names are made. Without
             one, the category is that of a folder on the path (a name of the paper's or a synset), or "unknown".
@@ -259,7 +260,7 @@ def _convert_one(job: _Job) -> int | Exception:
     return 1
 
 
-# Reading a mesh file: any format of trimesh, with its textures, materials and colours.
+# Reading a mesh file: any format of trimesh or `game_meshes`, with its textures, materials and colours.
 
 
 class MeshError(Exception):
@@ -291,10 +292,12 @@ def load_surface(
         raise MeshError(f"larger than {_LARGEST_FILE >> 20} MB: reduce its number of faces")
     try:
         files = _Files(path, Path(root) if root else path.parent.parent)
+        suffix = path.suffix.lower()
         with path.open("rb") as file:
-            scene = trimesh.load(
-                file, file_type=path.suffix[1:].lower(), resolver=files, force="scene", process=False
-            )
+            if suffix in game_meshes.READERS:
+                scene = game_meshes.READERS[suffix](file.read(), files.get)
+            else:
+                scene = trimesh.load(file, file_type=suffix[1:], resolver=files, force="scene", process=False)
         parts = _parts(scene)  # pyright: ignore[reportArgumentType]
     except MeshError:
         raise
@@ -336,6 +339,12 @@ class _Files(FilePathResolver):
         name = name.strip().replace("\\", "/")
         for candidate in (name, name.lstrip("/"), name.rpartition("/")[2]):
             path = Path(self.parent, candidate).resolve()
+            if path.is_relative_to(self._root) and path.is_file():
+                return path.read_bytes()
+        paints = (
+            Path(self.parent).resolve().parent / "Textures"
+        )  # FlightGear: in it is a folder for each airline
+        for path in sorted(paints.rglob(glob.escape(name.rpartition("/")[2]))):
             if path.is_relative_to(self._root) and path.is_file():
                 return path.read_bytes()
         raise FileNotFoundError(name)
