@@ -147,7 +147,8 @@ def test_reconstruct_writes_a_cloud_and_a_page(smoke_run: Path, picture: Path, t
         main(["reconstruct", str(smoke_run), str(picture), str(picture), "--out", str(out), "--steps", "1"])
         == 0
     )
-    assert sorted(path.name for path in out.iterdir()) == ["reconstruction.html", "reconstruction.ply"]
+    names = ["explore.html", "reconstruction.html", "reconstruction.ply"]
+    assert sorted(path.name for path in out.iterdir()) == names
     cloud = trimesh.load(out / "reconstruction.ply")
     assert isinstance(cloud, trimesh.PointCloud)
     assert cloud.vertices.shape == (256, 3)

@@ -1,4 +1,4 @@
-"""The command line: `python -m train data|fit|reconstruct|evaluate|experiment|demo`."""
+"""The command line: `python -m train data|fit|reconstruct|explore|evaluate|experiment|demo`."""
 
 from __future__ import annotations
 
@@ -91,7 +91,8 @@ Fit.__doc__ = f"""Train an auto-encoder of shapes, then a generator: stage 1 on 
 class Reconstruct:
     """Reconstruct one object from 1 to 24 pictures of it; no cameras needed.
 
-    Writes DIR/reconstruction.ply and DIR/reconstruction.html, a page with the pictures and the cloud to turn.
+    Writes DIR/reconstruction.ply, DIR/reconstruction.html, a page with the pictures and the cloud to turn, and
+    DIR/explore.html, the page of the command `explore`.
     Pictures should show the object alone on white or on transparency, about three quarters of the frame.
     """
 
@@ -115,6 +116,29 @@ class Reconstruct:
         reconstruct_to_files(
             self.model, self.images, self.out, groups=self.groups, steps=self.steps, seed=self.seed
         )
+
+
+@dataclasses.dataclass
+class Explore:
+    """Write a page on which one drags through the codes of an image and sees what it leaves open; no cameras needed.
+
+    The page stands alone: it needs neither a server nor a network connection. With several images of one object it also
+    shows the shape on which they agree. Pictures as for `reconstruct`.
+    """
+
+    model: Annotated[Positional[Path], arg(metavar="RUN")]
+    """A run's directory, a .safetensors file of one, or the word `pretrained`."""
+    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")]
+    """Pictures of one object."""
+    out: Path
+    """The page, an .html file."""
+    seed: int = 0
+    """Draws the codes."""
+
+    def run(self) -> None:
+        from train.evaluation.reconstruct import explore_to_file
+
+        explore_to_file(self.model, self.images, self.out, seed=self.seed)
 
 
 @dataclasses.dataclass
@@ -271,6 +295,7 @@ def _parse(arguments: list[str]) -> Any:
         Annotated[Data, subcommand("data")]
         | Annotated[Fit, subcommand("fit", default=fit)]
         | Annotated[Reconstruct, subcommand("reconstruct")]
+        | Annotated[Explore, subcommand("explore")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Experiment, subcommand("experiment")]
         | Annotated[Demo, subcommand("demo")]

@@ -1,4 +1,4 @@
-"""The `reconstruct` command: images in, a point cloud (PLY) and an HTML page out."""
+"""The commands `reconstruct` and `explore`: images in, a point cloud (PLY) and HTML pages out."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from train.data.cutout import cut_out
 from train.data.images import is_cut_out, read_images, read_rgba
 from train.data.layouts import pictures_of
 from train.errors import UserError
+from train.evaluation.explore import explore, not_explorable
 from train.evaluation.inference import reconstruct
 from train.evaluation.runs import open_run
-from train.files import replacing
+from train.files import remove, replacing
+from train.show.explorer import write_explorer
 
 MOST_IMAGES = 24
 _ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -31,9 +33,9 @@ def reconstruct_to_files(
     steps: int | None = None,
     seed: int = 0,
 ) -> None:
-    """Reconstructs one object and writes reconstruction.ply and reconstruction.html into `out`.
+    """Reconstructs one object and writes reconstruction.ply, reconstruction.html and explore.html into `out`.
 
-    Nothing is written before everything is computed.
+    Nothing is written before everything is computed. There is no explore.html if predictions do not depend on codes.
 
     Args:
         run: a run's directory, a .safetensors file of one, or "pretrained".
@@ -49,9 +51,7 @@ def reconstruct_to_files(
     from train.show.pages import write_reconstruction_page
 
     out = Path(out)
-    images = image_files(images)
-    if not 1 <= len(images) <= MOST_IMAGES:
-        raise UserError(f"reconstruct takes 1 to {MOST_IMAGES} images; got {len(images)}")
+    images = _object_files(images, command="reconstruct")
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is a file; --out names a directory")
     if (groups is not None and groups < 1) or (steps is not None and steps < 0):
@@ -60,15 +60,59 @@ def reconstruct_to_files(
     model, config, _ = open_run(run)
     found = reconstruct(model, pictures, groups=groups, steps=steps, seed=seed, settings=config.inference)
     points = found.points[0]
-    made = f"{len(points)} points from {len(images)} image{'s' if len(images) > 1 else ''}"
+    answers = None if not_explorable(model) else explore(model, pictures, found.codes[0], seed=seed)
+    made = f"{len(points)} points from {_count(images)}"
     if len(found.history):
         before, after = found.history[0, 0].item(), found.history[found.kept[0], 0].item()
         made += f"; the views' disagreement (chamfer x100) fell from {before:.2f} to {after:.2f}"
 
+    written = [out / "reconstruction.ply", out / "reconstruction.html"]
     with replacing(out / "reconstruction.html") as page:
         write_reconstruction_page(page, pictures, points, title="Reconstruction", subtitle=made)
         write_points(out / "reconstruction.ply", points)
-    print(f"wrote {out}/reconstruction.ply and {out}/reconstruction.html: {made}")
+        if answers:
+            write_explorer(out / "explore.html", answers)
+            written.append(out / "explore.html")
+        else:
+            remove(out / "explore.html")  # of an earlier reconstruction
+    print(f"wrote {', '.join(map(str, written))}: {made}")
+
+
+def explore_to_file(run: str | Path, images: Sequence[str | Path], out: str | Path, *, seed: int = 0) -> None:
+    """Writes a page on which one drags through the codes of each image of an object; see `train.show.explorer`.
+
+    Args:
+        run: a run's directory, a .safetensors file of one, or "pretrained".
+        images: 1 to 24 images of the object, or folders of them.
+        out: the .html file.
+        seed: of the random codes.
+
+    Raises:
+        UserError: not a run, one whose predictions do not depend on a code, not an image, or `out` is a directory.
+    """
+    out = Path(out)
+    images = _object_files(images, command="explore")
+    if out.is_dir():
+        raise UserError(f"{out} is a directory; --out names a file, for example {out / 'page.html'}")
+    pictures = read_pictures(images)
+    model, config, _ = open_run(run)
+    obstacle = not_explorable(model)
+    if obstacle:
+        raise UserError(f"{run} cannot be explored: {obstacle}")
+    codes = reconstruct(model, pictures, seed=seed, settings=config.inference).codes[0]
+    write_explorer(out, explore(model, pictures, codes, seed=seed))
+    print(f"wrote {out}: {_count(images)}, {out.stat().st_size // 1000} kB; open it in a browser")
+
+
+def _count(images: Sequence[Path]) -> str:
+    return f"{len(images)} image{'s' if len(images) > 1 else ''}"
+
+
+def _object_files(images: Sequence[str | Path], *, command: str) -> list[Path]:
+    files = image_files(images)
+    if not 1 <= len(files) <= MOST_IMAGES:
+        raise UserError(f"{command} takes 1 to {MOST_IMAGES} images; got {len(files)}")
+    return files
 
 
 def image_files(paths: Sequence[str | Path]) -> list[Path]:
