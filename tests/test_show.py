@@ -206,9 +206,11 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.raises(KeyboardInterrupt):
         demo(out, shapes=8, seed=3, config=_SMOKE, progress=False)
     watch.join()
-    assert json.loads((out / "times.json").read_text())["finished"] == ["data"]
+    assert json.loads((out / "times.json").read_text())["finished"] == ["first look", "data"]
     assert not (out / "run" / "evaluation.json").exists()
-    assert not (out / "report.html").exists()
+    first = (out / "report.html").read_text()
+    assert "The weights that come with the repository" in first
+    assert "How was it trained?" not in first
 
     page = demo(out, shapes=8, seed=3, config=_SMOKE, progress=False)
     assert page == out / "report.html"
@@ -244,7 +246,15 @@ def test_the_report_holds_table_figures_configuration_and_clouds(finished: Path)
     examples = range(1, 1 + min(3, result["data"]["shapes"]))
     numbered = [f"{kind}_{i}" for kind in ("predictions", "reconstruction") for i in examples]
     assert written == sorted(["overview", "errors", "curves", *numbered])
-    assert body.count("data:image/png;base64") == len(written)
+    of_shipped_weights = 2  # the overview of unseen shapes, and the photographs
+    assert body.count("data:image/png;base64") == len(written) + of_shipped_weights
+    assert body.index("The weights that come with the repository") < body.index(
+        "A small network, trained here"
+    )
+    explorers = re.findall(r'<a href="(shipped/explore-[a-z]+\.html)">', body)
+    assert len(explorers) == 3
+    for address in explorers:
+        assert "Plane of codes" in (finished / address).read_text()
     assert not LOADED_FROM_ELSEWHERE.search(body)
 
 
@@ -253,7 +263,9 @@ def test_the_demo_leaves_what_the_commands_leave(finished: Path):
     assert (finished / "reconstruction" / "reconstruction.ply").stat().st_size > 0
     assert (finished / "reconstruction" / "reconstruction.html").stat().st_size > 0
     times = json.loads((finished / "times.json").read_text())
-    assert times["finished"] == ["data", "training", "evaluation", "reconstruction", "report"]
+    assert times["finished"] == [
+        "first look", "data", "training", "evaluation", "reconstruction", "report",
+    ]  # fmt: skip
     assert all(value > 0 for value in times["seconds"].values())
     assert not list(finished.rglob(".*.tmp"))
 
@@ -267,11 +279,27 @@ def test_a_second_call_reuses_what_is_there(finished: Path):
     ]
     before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in kept[:3]]
     seconds = kept[3].read_bytes()
+    kept_section = finished / "shipped" / "section.json"
+    written = kept_section.stat().st_mtime_ns
     (finished / "report.html").unlink()
     demo(finished, shapes=8, seed=3, config=_SMOKE, progress=False)
     assert (finished / "report.html").exists()
     assert [(path.read_bytes(), path.stat().st_mtime_ns) for path in kept[:3]] == before
     assert kept[3].read_bytes() == seconds
+    assert kept_section.stat().st_mtime_ns == written
+
+
+def test_photographs_are_shown_with_what_they_leave_open():
+    clouds = torch.rand(3, 40, 3) - 0.5
+    one = figures.Photographed("a car", torch.rand(1, 3, 32, 32), clouds, clouds[0])
+    figure = figures.photographs_figure([one, one])
+    found = [axes.get_title() for axes in figure.axes[:5]]
+    assert found == ["pictures", "code 1", "code 2", "code 3", "code 1, from behind"]
+    several = figures.Photographed("a ship", torch.rand(2, 3, 32, 32), clouds, clouds.flatten(0, 1), "agreed")
+    figure = figures.photographs_figure([one, several])
+    assert [axes.get_title() for axes in figure.axes[5:7]] == ["from all pictures", "from behind"]
+    words = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert words == ["a car", "a ship", "agreed"]
 
 
 def test_other_settings_in_the_same_directory_are_refused(finished: Path):
@@ -301,4 +329,5 @@ def test_an_example_is_predicted_from_the_front(smoke_run: Path, tiny_data: Path
 
 def test_the_demo_recipe_is_the_cpu_profile_cut_short():
     assert DEMO_CONFIG.profile == "cpu"
-    assert 1_000 < sum(stage.steps for stage in DEMO_CONFIG.stages) < 4_000
+    assert DEMO_CONFIG.recipe == "whole-shapes"
+    assert 400 < sum(stage.steps for stage in DEMO_CONFIG.stages) < 4_000

@@ -1,44 +1,57 @@
-"""The demo: data, training, evaluation, reconstruction and a report, with the functions behind the commands."""
+"""The demo: what the shipped weights answer, then the whole chain from data to a report about a network of its own."""
 
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import torch
+
 from train.config import FitConfig, scaled
-from train.data import ShapeTree
+from train.data import Shape, ShapeTree
 from train.data.procedural import generate
-from train.data.tree_files import render_folder
+from train.data.tree_files import SPLITS, render_folder
+from train.errors import UserError
 from train.evaluation.evaluate import evaluate
-from train.evaluation.examples import report_run
-from train.evaluation.reconstruct import reconstruct_to_files
-from train.evaluation.runs import best_weights
+from train.evaluation.examples import make_example, report_run
+from train.evaluation.reconstruct import explore_to_file, read_pictures, reconstruct_to_files
+from train.evaluation.runs import PRETRAINED, best_weights, open_run
 from train.files import write_text
 from train.methods import recipe
+from train.show import figures, pages
+from train.show.report import shipped_weights_section
 from train.training.trainer import fit
 
-# Two fifths of the profile's steps: about six minutes on two cores, and enough for more views to lower the error.
-DEMO_CONFIG = scaled(recipe("ours", "cpu"), 0.4)
+# A fifth of the profile's steps: about five minutes on two cores, and enough for more views to lower the error.
+DEMO_CONFIG = scaled(recipe("ours", "cpu", "whole-shapes"), 0.2)
 _RENDER_SIZE = 112
 _CATEGORIES = ("chair", "display")  # learnt in so short a training
+
+# Objects that the shipped weights have not seen: no data that they were trained on have this seed.
+_UNSEEN_SEED = 1_000
+_UNSEEN_CATEGORIES = ("chair", "sofa", "car", "table", "airplane", "loudspeaker")
+_PHOTOGRAPHS = Path(__file__).parents[1] / "examples" / "photographs"
+_CODES = 3
 
 
 def demo(
     out: str | Path,
     *,
-    shapes: int = 400,
+    shapes: int = 240,
     seed: int = 0,
     config: FitConfig = DEMO_CONFIG,
     progress: bool = True,
 ) -> Path:
-    """Runs the whole chain on generated shapes; a second call continues where the first was stopped.
+    """Shows the shipped weights, then runs the whole chain; a second call continues where the first was stopped.
 
     Args:
-        out: directory to write to: data/, run/, reconstruction/, figures/ and report.html.
-        shapes: number of generated chairs and displays in all splits together.
+        out: directory to write to: shipped/, data/, run/, reconstruction/, figures/ and report.html, which is there
+            after the first phase and rewritten after the last.
+        shapes: number of generated chairs and displays in all splits together, each with its three backs.
         seed: of data and examples.
         config: the training's configuration.
         progress: show progress bars.
@@ -53,16 +66,26 @@ def demo(
     out = Path(out)
     data, run = out / "data", out / "run"
     clock = _Clock(out / "times.json")
+    steps = sum(stage.steps for stage in config.stages)
 
-    with clock.phase("data", f"1/5 {shapes} shapes with more than one possible back -> {data}"):
-        print(generate(data, shapes=shapes, categories=_CATEGORIES, seed=seed, size=_RENDER_SIZE).summary())
+    with clock.phase(
+        "first look", "1/6 the weights that come with the repository, on objects they have not seen"
+    ):
+        section = _shipped_weights(out, seed=seed)
+    print(f"Open {out / 'report.html'} in a browser; it is completed at the end.")
 
-    with clock.phase("training", f"2/5 training, {sum(s.steps for s in config.stages)} steps -> {run}"):
+    with clock.phase("data", f"2/6 {shapes} objects with three possible backs each -> {data}"):
+        made = generate(
+            data, shapes=shapes, categories=_CATEGORIES, seed=seed, size=_RENDER_SIZE, variants=3, fronts=2
+        )
+        print(made.summary())
+
+    with clock.phase("training", f"3/6 training a small network, {steps} steps -> {run}"):
         finished = fit(data, run, config, resume=(run / "config.json").exists(), progress=progress)
         if not finished:
             raise KeyboardInterrupt
 
-    with clock.phase("evaluation", "3/5 evaluation on shapes that were not used for training"):
+    with clock.phase("evaluation", "4/6 evaluation on shapes that were not used for training"):
         if not _up_to_date(run):
             evaluate(run, data, progress=progress)
 
@@ -70,14 +93,73 @@ def demo(
     images = sorted(render_folder(data, test.ids[0]).glob("render_*.png"))
     with clock.phase(
         "reconstruction",
-        f"4/5 reconstruction of one of them from {len(images)} images -> {out / 'reconstruction'}",
+        f"5/6 reconstruction of one of them from {len(images)} images -> {out / 'reconstruction'}",
     ):
         reconstruct_to_files(run, images, out / "reconstruction", seed=seed)
 
-    with clock.phase("report", "5/5 the report"):
-        page = report_run(out, run=run, data=data, seconds=clock.seconds, seed=seed)
+    with clock.phase("report", "6/6 the report"):
+        page = report_run(out, run=run, data=data, seconds=clock.seconds, seed=seed, first=section)
     print(f"\nDone in {sum(clock.seconds.values()) / 60:.1f} minutes. Open {page} in a browser.")
     return page
+
+
+def _shipped_weights(out: Path, *, seed: int) -> list[str]:
+    """What the shipped weights answer, as a section of the report; also written as a page of its own at first.
+
+    Pages to explore are written to out/shipped/.
+    """
+    kept = out / "shipped" / "section.json"
+    if kept.exists():
+        return json.loads(kept.read_text())
+    try:
+        model, config, _ = open_run(PRETRAINED)
+    except UserError as error:  # a checkout without them
+        print(f"note: left out: {error}", file=sys.stderr)
+        return []
+    data = out / "shipped" / "data"
+    generate(
+        data,
+        shapes=len(_UNSEEN_CATEGORIES),
+        categories=_UNSEEN_CATEGORIES,
+        seed=_UNSEEN_SEED,
+        size=_RENDER_SIZE,
+    )
+    unseen = [shape for split in SPLITS for shape in _shapes(data, split)]
+    unseen.sort(key=lambda shape: _UNSEEN_CATEGORIES.index(shape.category))
+    examples = [make_example(model, shape, config, seed=seed, codes=_CODES) for shape in unseen]
+    photographed, links = [], {}
+    for path in sorted(_PHOTOGRAPHS.glob("*.png")):
+        picture = read_pictures([path])
+        codes = torch.randn(_CODES, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
+        with torch.no_grad():
+            clouds = model(picture, codes)[:, 0]
+        photographed.append(figures.Photographed(path.stem, picture, clouds, clouds[0]))
+    for example, shape in zip(examples, unseen, strict=True):
+        if shape.category in ("chair", "sofa"):
+            front = render_folder(data, shape.id) / f"render_{example.chosen}.png"
+            links[f"an unseen {shape.category}"] = _explorer(out, shape.category, front, seed=seed)
+    for path in sorted(_PHOTOGRAPHS.glob("sedan.png")):
+        links["the photograph of a car"] = _explorer(out, path.stem, path, seed=seed)
+    section = shipped_weights_section(examples, photographed, links)
+    page = pages.page(
+        "What the shipped weights answer", section, subtitle="A small network of its own is next."
+    )
+    write_text(out / "report.html", page)
+    write_text(kept, json.dumps(section))
+    return section
+
+
+def _shapes(data: Path, split: str) -> list[Shape]:
+    try:
+        return list(ShapeTree(data, split).iter_valid())
+    except UserError:  # no shape of so few is in this split
+        return []
+
+
+def _explorer(out: Path, name: str, image: Path, *, seed: int) -> str:
+    """Writes the page to explore an image; returns its address relative to the report."""
+    explore_to_file(PRETRAINED, [image], out / "shipped" / f"explore-{name}.html", seed=seed)
+    return f"shipped/explore-{name}.html"
 
 
 class _Clock:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -28,6 +28,7 @@ def report_run(
     data: str | Path,
     seconds: Mapping[str, float] | None = None,
     seed: int = 0,
+    first: Sequence[str] = (),
 ) -> Path:
     """Writes out/report.html and out/figures/*.png about an evaluated run.
 
@@ -37,6 +38,7 @@ def report_run(
         data: root of the data tree; examples come from its test split.
         seconds: duration of each phase, for the record.
         seed: of the examples' random codes.
+        first: parts of the page that precede those about the run.
 
     Returns:
         The page.
@@ -60,6 +62,7 @@ def report_run(
         config=config,
         run=str(run),
         seconds=seconds or {},
+        first=first,
     )
 
 

@@ -187,11 +187,14 @@ class Photographed(NamedTuple):
 def photographs_figure(objects: Sequence[Photographed]) -> Figure:
     """A row for each object: some of its pictures, predictions from the first, and the reconstruction from all.
 
-    Clouds are seen from the network's own front, and the reconstruction from behind, too.
+    Clouds are seen from the network's own front, and the reconstruction from behind, too. If no object has more than
+    one picture, a reconstruction is the first prediction and only shown from behind.
     """
-    shown = min(max(len(each.pictures) for each in objects), _SHOWN_PICTURES)
+    most = max(len(each.pictures) for each in objects)
+    shown = min(most, _SHOWN_PICTURES)
     count = len(objects[0].predictions)
-    figure, panels = grid(rows=len(objects), columns=shown + count + 2)
+    last = ["from all pictures", "from behind"] if most > 1 else ["code 1, from behind"]
+    figure, panels = grid(rows=len(objects), columns=shown + count + len(last))
     eye = torch.tensor([[0.94, 0.68, 1.63]])  # 30 degrees to the side, 20 up
     front = PinholeCamera.look_at(eye, focal_px=240.0, height=128, width=128)
     camera = PinholeCamera(
@@ -210,12 +213,13 @@ def photographs_figure(objects: Sequence[Photographed]) -> Figure:
         ahead, behind = narrowed(camera, clouds)
         for axes, cloud in zip(line[shown:], each.predictions, strict=False):
             draw_cloud(axes, cloud, ahead)
-        for axes, side in zip(line[-2:], (ahead, behind), strict=True):
+        for axes, side in zip(line[-len(last) :], (ahead, behind)[-len(last) :], strict=True):
             draw_cloud(axes, each.reconstruction, side)
         if each.remark:
-            caption(line[-2], each.remark)
-    codes = [f"from the first, code {number + 1}" for number in range(count)]
-    titles(panels, ["pictures", *[""] * (shown - 1), *codes, "from all pictures", "from behind"])
+            caption(line[-len(last)], each.remark)
+    from_first = "from the first, " if most > 1 else ""
+    codes = [f"{from_first}code {number + 1}" for number in range(count)]
+    titles(panels, ["pictures", *[""] * (shown - 1), *codes, *last])
     return figure
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,9 +22,15 @@ _INTRODUCTION = (
     "One photograph does not show what the back of a chair looks like. The generator takes an image and a random code "
     "and predicts a shape that fits the image; another code gives another such shape. With several images of one "
     "object, codes are searched and then optimised until the shapes predicted from all images agree; the positions of "
-    "the cameras are not needed. The training loss uses depth maps, never a whole shape. The objects on this page were "
-    "not used for training."
+    "the cameras are not needed. The objects on this page were not used for training."
 )
+_SUPERVISION = {
+    False: " The training loss uses depth maps, never a whole shape.",
+    True: (
+        " Every prediction has to fit the depth map of its image; of several predictions for an image the one nearest "
+        "to the whole shape is trained on all of it, so that codes choose between shapes."
+    ),
+}
 _COLUMNS = {
     "gt_to_pred": "ground truth to prediction",
     "pred_to_gt": "prediction to ground truth",
@@ -41,6 +49,7 @@ def write_report(
     config: str,
     run: str,
     seconds: Mapping[str, float],
+    first: Sequence[str] = (),
 ) -> Path:
     """Writes out/report.html and out/figures/*.png.
 
@@ -52,6 +61,7 @@ def write_report(
         config: the training's configuration as text.
         run: where the run is, for the reader.
         seconds: duration of each phase; may be empty.
+        first: parts of the page that precede those about the run.
 
     Returns:
         The page.
@@ -67,8 +77,11 @@ def write_report(
     }
     for name, figure in drawn.items():
         figures.save(figure, out / "figures" / f"{name}.png")
+    whole_shapes = any(json.loads(config)[stage].get("shape_weight") for stage in ("stage1", "stage2"))
     body = [
-        pages.paragraph(_INTRODUCTION),
+        pages.paragraph(_INTRODUCTION + _SUPERVISION[whole_shapes]),
+        *first,
+        *(["<h2>A small network, trained here</h2>"] if first else []),
         pages.drawing(
             drawn["overview"],
             "Each pair of rows is one object: above from the side of the image, below from behind.",
@@ -88,6 +101,39 @@ def write_report(
         out / "report.html", pages.page("Shapes from single and from several images", body, subtitle=subtitle)
     )
     return out / "report.html"
+
+
+def shipped_weights_section(
+    examples: Sequence[Example], photographed: Sequence[figures.Photographed], explorers: Mapping[str, str]
+) -> list[str]:
+    """What the weights that come with the repository answer: unseen shapes, photographs, and pages to explore.
+
+    Args:
+        examples: shapes that the weights were not trained on.
+        photographed: objects in photographs; may be empty.
+        explorers: words about an image -> address of the page on which to explore it.
+    """
+    links = "; ".join(
+        f'<a href="{html.escape(address)}">{html.escape(words)}</a>' for words, address in explorers.items()
+    )
+    body = [
+        "<h2>The weights that come with the repository</h2>",
+        pages.paragraph(
+            "Objects that they have not seen. Each pair of rows is one object: the image and predictions for it with "
+            "different codes, the reconstruction from all images, and the true shape; above from the side of the "
+            "image, below from behind, where the predictions may differ."
+        ),
+        pages.drawing(figures.overview_figure(examples), "Generated objects."),
+        f"<p>Drag through the codes of an image, and see what it leaves open: {links}.</p>",
+    ]
+    if photographed:
+        body += [
+            pages.drawing(
+                figures.photographs_figure(photographed),
+                "Photographs, with unknown cameras and true shapes. The network has been trained on renders only.",
+            )
+        ]
+    return body
 
 
 def _predictions(
