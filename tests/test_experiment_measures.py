@@ -146,6 +146,18 @@ def test_coverage_is_measured_and_drawn(study: Study, monkeypatch: pytest.Monkey
     assert claim["gain"] == pytest.approx(100 * more) and claim["words"] in page
 
 
+def test_coverage_of_a_given_run_trains_nothing(
+    study: Study, smoke_run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    of_run = dataclasses.replace(study, run=smoke_run, out=tmp_path / "out", seeds=2)
+    result, page = made_once("coverage", of_run, monkeypatch)
+    assert not (of_run.out / "runs").exists()
+    row = result["rows"][f"{smoke_run}, 10 codes"]
+    assert row["none"]["mean"] > 0.3  # after 50 steps
+    assert f"the run {smoke_run}, codes drawn 2 times" in page
+    assert not result["claims"]
+
+
 def test_backs_cover_themselves_and_nothing_else_does() -> None:
     obj = make_object(AmbiguousObject("loudspeaker", (0, 2)), 64)
     near = obj.limits[APART]

@@ -232,7 +232,8 @@ class Experiment:
     pictures: Path | None = None
     """photos: a folder with a folder of pictures for each object."""
     run_: Annotated[Path | None, arg(name="run")] = None
-    """agreement: the run it is about, a .safetensors file of one, or the word `pretrained`; trained if not given."""
+    """agreement, coverage: the run it is about, a .safetensors file of one, or the word `pretrained`; networks are
+    trained if not given."""
     views: int = 8
     """agreement: views per shape."""
 

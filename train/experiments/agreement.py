@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,6 +34,7 @@ from train.experiments.statistics import spreads, transposed
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
 from train.experiments.table import NAMES
+from train.methods.weights import weights_digest
 from train.processes import progress_bar
 from train.show import figures
 from train.show.tables import markdown_lines
@@ -140,11 +140,8 @@ def _measured(study: Study, run: Path, what: _Measurement) -> Metrics:
         return stack_seeds([evaluate(code_seed=draw) for draw in code_seeds])
 
     # The name of a run is not enough: any run can be given, and one that trains on gets other weights.
-    weights = hashlib.sha256()
-    for name, values in opened.model.state_dict().items():
-        weights.update(name.encode() + values.numpy().tobytes())
     parts = [dataclasses.asdict(settings), views, seed, code_seeds, test.fingerprint]
-    return study.kept(["agreement", weights.hexdigest(), *parts], measure)
+    return study.kept(["agreement", weights_digest(opened.model), *parts], measure)
 
 
 def _floor(test: LoadedSplit, *, points: int, clouds: int) -> float:

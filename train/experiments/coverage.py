@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +27,7 @@ from train.data.procedural import variants_of
 from train.data.render import Renderer, orbit_camera
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
+from train.evaluation.runs import open_run
 from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.paper import without_codes
 from train.experiments.statistics import (
@@ -41,6 +42,7 @@ from train.experiments.statistics import (
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, unchanged
 from train.methods.ours import highly_diverse
+from train.methods.weights import weights_digest
 from train.processes import progress_bar
 from train.show import figures
 from train.show.tables import markdown_lines
@@ -82,9 +84,35 @@ class Object(NamedTuple):
     """`apart` -> within this distance of a back a cloud is close to it."""
 
 
+class _Network(NamedTuple):
+    """A trained network, the part of the measurements' keys that names its weights, and the seed of its codes."""
+
+    key: list[Any]
+    model: Callable[[], Predictor]
+    seed: int
+
+
 def configs(study: Study) -> list[FitConfig]:
     """Every training that the measurement needs, seed by seed."""
-    return study.configs(*(change for change, _ in _NETWORKS.values()))
+    return [] if study.run else study.configs(*(change for change, _ in _NETWORKS.values()))
+
+
+def _networks(study: Study) -> dict[str, tuple[list[_Network], tuple[int, ...]]]:
+    """Row -> networks and numbers of codes: of the study's trainings, or of a given run with as many draws of codes."""
+    if study.run:
+        opened = open_run(study.run)
+        key = ["run", weights_digest(opened.model)]
+        codes = CODES if opened.model.takes_codes else (1,)
+        draws = [_Network(key, lambda: opened.model, seed) for seed in range(study.seeds)]
+        return {str(study.run): (draws, codes)}
+    found = {}
+    for name, (change, codes) in _NETWORKS.items():
+        trained = [study.config(change, seed=seed) for seed in range(study.seeds)]
+        networks = [
+            _Network(study.weights_key(c), functools.partial(study.network, c), c.seed) for c in trained
+        ]
+        found[name] = networks, codes
+    return found
 
 
 def make(study: Study) -> Outcome:
@@ -93,12 +121,15 @@ def make(study: Study) -> Outcome:
 
     Besides our method with 10 and 50 codes: 10 codes of the highly diverse model; the deterministic network's single
     prediction; as many random training shapes of the category; and samples of the backs themselves, which reach all.
+    With `study.run`, that run's network alone in place of the trained ones.
 
     Raises:
-        UserError: the first tree's test split has no object of a family that hides something.
+        UserError: the first tree's test split has no object of a family that hides something, or no such run.
     """
     study.train_all(configs(study))
-    config = study.config(unchanged, seed=0)
+    config = study.config(unchanged, seed=0) if study.run is None else open_run(study.run).config
+    networks = _networks(study)
+    first = next(iter(networks.values()))[0][0]
     hiders = [found for found in map(ambiguous_object, study.split(config, "test").ids) if found]
     if not hiders:
         raise UserError(
@@ -114,23 +145,25 @@ def make(study: Study) -> Outcome:
 
     inputs = [[NEAR, APART], list(map(list, hiders))]
     rows: dict[str, list[Metrics]] = {}
-    for of_seed in study.configs(unchanged):
-        for name, (change, codes) in _NETWORKS.items():
-            network = study.config(change, seed=of_seed.seed)
+    for name, (trained, codes) in networks.items():
+        for network in trained:
+            seed = [network.seed] if study.run else []  # else the key of the weights has it
             found = study.kept(
-                ["coverage", *study.weights_key(network), list(codes), *inputs],
+                ["coverage", *network.key, *seed, list(codes), *inputs],
                 lambda network=network, codes=codes: _predicted(study, network, objects(), codes),
             )
             for count in codes:
                 row = f"{name}, {count} codes" if count > 1 else name
                 rows.setdefault(row, []).append(_starting_with(f"{count}/", found))
-    key = ["coverage", "without network", *study.weights_key(config), *inputs]
-    found = study.kept(key, lambda: _without_network(study, config, objects()))
+    key = ["coverage", "without network", *first.key, *inputs]
+    found = study.kept(key, lambda: _without_network(study, config, first.model().points, objects()))
     rows[_RETRIEVED] = [_starting_with(f"{CODES[0]}/", found)]
     rows[f"{CODES[0]} samples of the backs"] = [_starting_with(f"resampled {CODES[0]}/", found)]
     per_shape = {name: stacked(by_seed) for name, by_seed in rows.items()}
     categories = np.array([hider.category for hider in hiders])
     result = study.about(config) | {
+        "profile": config.profile,  # of the run, if there is one
+        "run": str(study.run) if study.run else None,
         "objects": len(hiders),
         "near": NEAR,
         "apart": APART,
@@ -141,10 +174,10 @@ def make(study: Study) -> Outcome:
         },
         "claims": _claims(per_shape),
     }
-    return Outcome(result, markdown(result), {"": _figure(study, hiders, size)})
+    return Outcome(result, markdown(result), {"": _figure(first.model(), hiders, size)})
 
 
-coverage = Experiment(make, configs)
+coverage = Experiment(make, configs, lambda study: [str(study.run)] if study.run else [])
 
 
 def _claims(rows: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict[str, Any]]:
@@ -156,6 +189,7 @@ def _claims(rows: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict[str, Any]
             f"{_COLUMNS[metric]}, %: {lower} < {higher}", 100 * (rows[higher][metric] - rows[lower][metric])
         )
         for metric, lower, higher in lower_and_higher
+        if {lower, higher} <= set(rows)
     ]
 
 
@@ -247,12 +281,12 @@ def _starting_with(prefix: str, metrics: Metrics) -> Metrics:
     return {name.removeprefix(prefix): v for name, v in metrics.items() if name.startswith(prefix)}
 
 
-def _predicted(study: Study, config: FitConfig, objects: Sequence[Object], codes: Sequence[int]) -> Metrics:
+def _predicted(study: Study, network: _Network, objects: Sequence[Object], codes: Sequence[int]) -> Metrics:
     """`_judge` over the objects of a network's predictions."""
-    model = study.network(config)
+    model = network.model()
     bar = progress_bar(objects, title="predictions", unit="object", progress=study.progress)
     return _over_objects(
-        [_judge(obj, predict(model, obj.image, max(codes), seed=config.seed), codes) for obj in bar]
+        [_judge(obj, predict(model, obj.image, max(codes), seed=network.seed), codes) for obj in bar]
     )
 
 
@@ -263,10 +297,10 @@ def predict(model: Predictor, image: Tensor, count: int, *, seed: int) -> Tensor
     return model(image[None], codes)[:, 0].contiguous()
 
 
-def _without_network(study: Study, config: FitConfig, objects: Sequence[Object]) -> Metrics:
+def _without_network(study: Study, config: FitConfig, points: int, objects: Sequence[Object]) -> Metrics:
     """`_judge` over the objects of random training shapes of the category, and as "resampled COUNT/NAME" of samples of
     the backs themselves; both as large as one prediction."""
-    count, points, train = CODES[0], study.network(config).points, study.split(config, "train")
+    count, train = CODES[0], study.split(config, "train")
     random = np.random.default_rng(0)
     found = []
     for obj in objects:
@@ -282,9 +316,12 @@ def _without_network(study: Study, config: FitConfig, objects: Sequence[Object])
 
 def markdown(result: Mapping[str, Any]) -> str:
     """A line for every row, claims, and a line for every family."""
+    made = trainings(result["seeds"]) + " of each"
+    if result["run"]:
+        made = f"the run {result['run']}, codes drawn {result['seeds']} times"
     head = (
         f"{result['objects']} held-out objects whose front hides one of three backs, profile `{result['profile']}`, "
-        f"{trainings(result['seeds'])} of each. Reached: share of an object's backs that are the nearest of some "
+        f"{made}. Reached: share of an object's backs that are the nearest of some "
         "prediction, and closer than half the smallest distance between two of its backs. Close to none: share of "
         "predictions that are so close to no back. Distance: mean over predictions, in the unit of this limit. Only "
         "points that distinguish the backs are counted, except in the last two columns."
@@ -300,17 +337,16 @@ def markdown(result: Mapping[str, Any]) -> str:
     return markdown_page(
         head,
         markdown_lines(["", *_COLUMNS.values()], rows),
-        claim_lines(result["claims"]),
+        *([claim_lines(result["claims"])] if result["claims"] else []),
         "Backs reached / predictions close to none, by family:",
         markdown_lines(["", *result["rows"]], by_category),
     )
 
 
-def _figure(study: Study, hiders: Sequence[AmbiguousObject], size: int) -> Figure:
+def _figure(model: Predictor, hiders: Sequence[AmbiguousObject], size: int) -> Figure:
     """For one object of each family: the front, its backs, and predictions with a few codes, all from one side
     behind."""
     chosen = list({hider.category: hider for hider in reversed(hiders)}.values())[::-1]
-    model = study.network(study.config(unchanged, seed=0))
     kinds = FAMILIES[chosen[0].category].modes
     figure, panels = figures.grid(rows=len(chosen), columns=1 + kinds + _SHOWN_CODES)
     side = orbit_camera(np.array([125.0]), np.array([20.0]), 128).to(dtype=torch.float32)

@@ -72,7 +72,7 @@ class Study:
     pictures: Path | None = None
     """For photos, a folder with a folder of photographs for each object."""
     run: Path | None = None
-    """For agreement, a trained run, as `train.evaluation.runs.open_run` takes it; trained here if not given."""
+    """For agreement and coverage, a trained run as `open_run` takes it; networks are trained here if not given."""
     views: int = 8
     """For agreement, views per shape."""
     measures: bool = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -119,3 +120,11 @@ def space_for(target: Path) -> Iterator[None]:
             f"{target} cannot be written ({error}); what was saved before is untouched: make room and continue "
             "with --resume"
         ) from error
+
+
+def weights_digest(network: nn.Module) -> str:
+    """Changes when the weights of a network change; the name of a run is the same when it trains on."""
+    digest = hashlib.sha256()
+    for name, values in network.state_dict().items():
+        digest.update(name.encode() + values.numpy().tobytes())
+    return digest.hexdigest()
