@@ -150,8 +150,8 @@ def test_every_turn_is_undone(ours):
             back = frame.applied(other)
             world = back.camera.cam_from_world @ torch.linalg.inv(shape.camera.cam_from_world)
             seen = (back.points @ back.camera.cam_from_world[0, :3, :3].T)[:, 2]
-            truth = (shape.points @ shape.camera.cam_from_world[0, :3, :3].T)[:, 2]
-            torch.testing.assert_close(seen, truth, atol=1e-5, rtol=0)
+            target = (shape.points @ shape.camera.cam_from_world[0, :3, :3].T)[:, 2]
+            torch.testing.assert_close(seen, target, atol=1e-5, rtol=0)
             torch.testing.assert_close(world[:, :3, 3], torch.zeros(len(world), 3), atol=1e-5, rtol=0)
 
 

@@ -46,7 +46,7 @@ def studio(tmp_path_factory):
     Half of the parts are light grey, as on white paper they are hard to see. The true masks come with them.
     """
     root = tmp_path_factory.mktemp("studio")
-    truth = {}
+    masks = {}
     for number, (category, paper, light_grey) in enumerate(
         [("chair", WHITE, True), ("table", CREAM, False), ("lamp", BLUE, True)]
     ):
@@ -66,8 +66,8 @@ def studio(tmp_path_factory):
             path = root / category / f"{view}.jpg"
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(photographs.as_jpeg(photo, quality))
-            truth[path.relative_to(root)] = photo.mask
-    return root, truth
+            masks[path.relative_to(root)] = photo.mask
+    return root, masks
 
 
 @pytest.fixture(scope="module")

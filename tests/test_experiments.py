@@ -108,7 +108,7 @@ def test_other_data_or_training_code_is_another_run(
 
 
 def test_packed_metrics_are_found_as_single_ones_are(tmp_path: Path) -> None:
-    measured = {"cd": torch.arange(3.0), "one, truth": torch.ones(2, 3)}
+    measured = {"cd": torch.arange(3.0), "one, target": torch.ones(2, 3)}
     first, second, third = ["a", 1], ["a", {"steps": 3}], ["b"]
     for key in (first, second):
         store.kept(tmp_path, key, lambda: measured)

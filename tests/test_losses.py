@@ -18,9 +18,9 @@ def camera(dtype: torch.dtype = torch.float64) -> dp.PinholeCamera:
 
 def scene(dtype: torch.dtype = torch.float64, count: int = 80) -> tuple[torch.Tensor, torch.Tensor]:
     """Predicted clouds, and depth maps of other clouds."""
-    truth = tie_free_clouds(2, 120, camera(), seed=1, dtype=dtype) * 0.8
+    target = tie_free_clouds(2, 120, camera(), seed=1, dtype=dtype) * 0.8
     points = tie_free_clouds(2, count, camera(), seed=2, dtype=dtype)
-    return points.requires_grad_(), dp.splat_depth(truth, camera(dtype)).depth
+    return points.requires_grad_(), dp.splat_depth(target, camera(dtype)).depth
 
 
 def front_case(dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
@@ -78,11 +78,11 @@ def test_the_projection_loss_moves_points_along_the_optical_axis_only_and_the_fr
     """In the camera's frame: x and y of the projection loss's gradient are zero to the last bit."""
     view = dp.PinholeCamera(torch.tensor([[30.0, 0, 8], [0, 30.0, 7], [0, 0, 1]]), torch.eye(4), 14, 16)
     generator = torch.Generator().manual_seed(3)
-    truth = torch.rand(1, 500, 3, generator=generator) * 0.6 + torch.tensor([-0.3, -0.3, 1.5])
+    target = torch.rand(1, 500, 3, generator=generator) * 0.6 + torch.tensor([-0.3, -0.3, 1.5])
     points = (
         torch.rand(1, 500, 3, generator=generator) * 0.8 + torch.tensor([-0.4, -0.4, 1.5])
     ).requires_grad_()
-    depth = dp.splat_depth(truth, view).depth
+    depth = dp.splat_depth(target, view).depth
     (projection,) = torch.autograd.grad(dp.projection_loss(points, view, depth), points)
     (front,) = torch.autograd.grad(dp.front_constraint(points, view, depth), points)
     assert (projection[..., :2] == 0).all()

@@ -68,30 +68,30 @@ CAMERA = dp.PinholeCamera.look_at(
 )
 
 
-def through_the_layer(points: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+def through_the_layer(points: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Splat, sample (a size that depends on the data) and compare."""
     splat = dp.splat_depth(points, CAMERA)
     seen = dp.sample_view(points, splat).points
-    chamfer = dp.chamfer_distance(seen.flatten(1, 2), truth, squared=False)
+    chamfer = dp.chamfer_distance(seen.flatten(1, 2), target, squared=False)
     return chamfer.a_to_b.mean() + chamfer.b_to_a.mean() + splat.depth.clamp(max=5).mean()
 
 
 def test_the_layer_compiles_into_one_graph_and_exports():
     generator = torch.Generator().manual_seed(0)
     points = (torch.rand(2, 60, 3, generator=generator) - 0.5).requires_grad_()
-    truth = torch.rand(2, 50, 3, generator=generator) - 0.5
-    plain = through_the_layer(points, truth)
-    compiled = torch.compile(through_the_layer, fullgraph=True, backend="aot_eager")(points, truth)
+    target = torch.rand(2, 50, 3, generator=generator) - 0.5
+    plain = through_the_layer(points, target)
+    compiled = torch.compile(through_the_layer, fullgraph=True, backend="aot_eager")(points, target)
     assert torch.allclose(plain, compiled)
     for x, y in zip(torch.autograd.grad(plain, points), torch.autograd.grad(compiled, points), strict=True):
         assert torch.allclose(x, y, atol=1e-6)
 
     class Layer(torch.nn.Module):
-        def forward(self, points, truth):
-            return through_the_layer(points, truth)
+        def forward(self, points, target):
+            return through_the_layer(points, target)
 
-    exported = torch.export.export(Layer(), (points.detach(), truth)).module()
-    assert torch.allclose(exported(points.detach(), truth), plain)
+    exported = torch.export.export(Layer(), (points.detach(), target)).module()
+    assert torch.allclose(exported(points.detach(), target), plain)
 
 
 @pytest.fixture(scope="module")
@@ -102,30 +102,30 @@ def elsewhere() -> str:
     return "lazy"
 
 
-def every_op(points: torch.Tensor, truth: torch.Tensor, camera: dp.PinholeCamera) -> list[torch.Tensor]:
+def every_op(points: torch.Tensor, target: torch.Tensor, camera: dp.PinholeCamera) -> list[torch.Tensor]:
     splat = dp.splat_depth(points, camera)
     sample = dp.sample_view(points, splat)
     unprojected = dp.unproject(splat.depth, camera)
-    chosen = dp.farthest_point_sample(truth, 7, lengths=torch.full((2,), 40, device=truth.device))
+    chosen = dp.farthest_point_sample(target, 7, lengths=torch.full((2,), 40, device=target.device))
     horizon = dp.visible_points(points, camera, method="horizon")
     outputs = [*splat, *sample, *dp.project(points, camera), *unprojected, chosen, horizon]
     outputs += dp.reproject(splat.depth, camera, camera[[1, 0]])
-    outputs += dp.soft_splat(points, camera, lengths=torch.full((2,), 50, device=truth.device))
-    outputs += [*dp.nearest(points, truth), *dp.chamfer_distance(points, truth, squared=False)]
-    outputs += dp.earth_mover_distance(points, truth)
+    outputs += dp.soft_splat(points, camera, lengths=torch.full((2,), 50, device=target.device))
+    outputs += [*dp.nearest(points, target), *dp.chamfer_distance(points, target, squared=False)]
+    outputs += dp.earth_mover_distance(points, target)
     # The lazy device lacks a view that torch takes in the backward pass of masked_scatter: no gradient of this one.
     constraint = dp.front_constraint(points, camera, splat.depth.detach() + 0.1).detach()
-    return [*outputs, dp.approxmatch(points, truth), constraint]
+    return [*outputs, dp.approxmatch(points, target), constraint]
 
 
 def test_tensors_of_another_device_come_back_on_it_with_their_gradient(elsewhere):
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(2, 60, 3, generator=generator) - 0.5
-    truth = torch.rand(2, 50, 3, generator=generator) - 0.5
+    target = torch.rand(2, 50, 3, generator=generator) - 0.5
     results, gradients = {}, {}
     for device in ("cpu", elsewhere):
         moved = points.to(device).requires_grad_()
-        outputs = every_op(moved, truth.to(device), CAMERA.to(device))
+        outputs = every_op(moved, target.to(device), CAMERA.to(device))
         assert {o.device.type for o in outputs} == {device}
         total = sum(torch.where(torch.isfinite(o), o, 0.0).sum() for o in outputs if o.requires_grad)
         (gradient,) = torch.autograd.grad(total, moved)

@@ -14,22 +14,22 @@ def camera(dtype: torch.dtype = torch.float64) -> dp.PinholeCamera:
 
 def scene(dtype: torch.dtype = torch.float64, count: int = 80) -> tuple[torch.Tensor, ...]:
     """Predicted clouds, occupancy logits of their points, and depth maps of other clouds."""
-    truth = tie_free_clouds(2, 120, camera(), seed=1, dtype=dtype) * 0.8
+    target = tie_free_clouds(2, 120, camera(), seed=1, dtype=dtype) * 0.8
     points = tie_free_clouds(2, count, camera(), seed=2, dtype=dtype, margin=3e-4)
     logits = torch.randn(2, count, generator=torch.Generator().manual_seed(0), dtype=dtype)
-    return points.requires_grad_(), logits.requires_grad_(), dp.splat_depth(truth, camera(dtype)).depth
+    return points.requires_grad_(), logits.requires_grad_(), dp.splat_depth(target, camera(dtype)).depth
 
 
 def test_only_the_soft_loss_moves_points_sideways():
     """In the camera's frame: x and y of the gradient of Lin's loss are zero to the last bit, whatever its options."""
     view = dp.PinholeCamera(torch.tensor([[30.0, 0, 8], [0, 30.0, 7], [0, 0, 1]]), torch.eye(4), 14, 16)
     random = torch.Generator().manual_seed(3)
-    truth = torch.rand(1, 500, 3, generator=random) * 0.4 + torch.tensor([-0.2, -0.2, 1.5])
+    target = torch.rand(1, 500, 3, generator=random) * 0.4 + torch.tensor([-0.2, -0.2, 1.5])
     points = (
         torch.rand(1, 500, 3, generator=random) * 0.8 + torch.tensor([-0.4, -0.4, 1.5])
     ).requires_grad_()
     logits = torch.randn(1, 500, generator=random).requires_grad_()
-    depth = dp.splat_depth(truth, view).depth
+    depth = dp.splat_depth(target, view).depth
     for options in ({}, {"upsample": 5}, {"logits": logits, "mask_weight": 1.0, "upsample": 2}):
         (gradient,) = torch.autograd.grad(dp.projection_loss(points, view, depth, **options), points)
         assert (gradient[..., :2] == 0).all()

@@ -67,21 +67,21 @@ def test_the_horizon_equals_the_reference_implementation(dtype, lengths):
 def test_the_defaults_of_the_horizon_hold_for_any_number_of_points_and_pixels(count, size):
     camera = cameras(torch.float32).resize(size, size)
     points = spheres(count, torch.float32)
-    truth = front_of_spheres(points, camera)
+    expected = front_of_spheres(points, camera)
     visible = dp.visible_points(points, camera, method="horizon")
-    assert (visible & ~truth).sum() < 0.03 * visible.sum()
-    assert (visible & truth).sum() > 0.65 * truth.sum()  # the limb of a sphere is hard
+    assert (visible & ~expected).sum() < 0.03 * visible.sum()
+    assert (visible & expected).sum() > 0.65 * expected.sum()  # the limb of a sphere is hard
 
 
 @pytest.mark.parametrize("method", ["horizon", "hpr"])
 def test_the_far_side_of_a_sphere_is_hidden_where_the_zbuffer_shows_it(method):
     camera, points = cameras(torch.float32).resize(112, 112), spheres(1500, torch.float32)
-    truth = front_of_spheres(points, camera)
+    expected = front_of_spheres(points, camera)
     naive = dp.visible_points(points, camera)
-    assert (naive & ~truth).sum() > 0.3 * naive.sum()
+    assert (naive & ~expected).sum() > 0.3 * naive.sum()
     visible = dp.visible_points(points, camera, method=method)
-    assert (visible & ~truth).sum() < 0.1 * visible.sum()
-    assert (visible & truth).sum() > 0.3 * truth.sum()
+    assert (visible & ~expected).sum() < 0.1 * visible.sum()
+    assert (visible & expected).sum() > 0.3 * expected.sum()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -175,14 +175,14 @@ def test_sample_view_and_the_front_constraint_take_any_visibility():
     from_flags = dp.sample_view(points, dp.visible_points(points, camera))
     assert torch.equal(from_splat.index, from_flags.index)
 
-    truth = dp.splat_depth(0.9 * spheres(4000, torch.float32, seed=1), camera).depth
-    sets = dp.front_sets(points, camera, truth, visibility="horizon")
+    target = dp.splat_depth(0.9 * spheres(4000, torch.float32, seed=1), camera).depth
+    sets = dp.front_sets(points, camera, target, visibility="horizon")
     assert torch.equal(sets.predicted_lengths, visible.sum(-1))
     paper, better = (
-        dp.front_constraint(points, camera, truth, visibility=v).item() for v in ("zbuffer", "horizon")
+        dp.front_constraint(points, camera, target, visibility=v).item() for v in ("zbuffer", "horizon")
     )
-    assert paper == dp.front_constraint(points, camera, truth).item()
-    assert better < paper  # the far side, which the z-buffer lets through, is far from the truth
+    assert paper == dp.front_constraint(points, camera, target).item()
+    assert better < paper  # the far side, which the z-buffer lets through, is far from the target
 
 
 def test_sample_view_refuses_flags_that_are_none():

@@ -192,7 +192,7 @@ class FitConfig:
     """Size of the network: full 192 x 256 images and 2048 points, cpu 96 x 128 and 512, smoke 48 x 64 and
     128."""
     recipe: Recipe = "paper"
-    """How the network is taught. "whole-shapes": by the data's target clouds too, of which every code may choose one
+    """How the network is trained. "whole-shapes": by the data's target clouds too, of which every code may choose one
     that fits the image. "paper": by the depth maps of the images alone."""
     variant: Variant = "standard"
     """The paper's main model, or its "highly diverse" one, whose predictions disagree more before search."""

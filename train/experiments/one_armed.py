@@ -42,7 +42,7 @@ CODES = 10
 _SHOWN = 3
 _TRUE_POINTS = 2048
 _CHANGES: dict[str, Change] = {"ours": unchanged, "deterministic": without_codes, "psgn": of_method("psgn")}
-ROWS = PLAIN, _, PSGN, _, CODED, TWO, TRUTH = (
+ROWS = PLAIN, _, PSGN, _, CODED, TWO, TARGET = (
     "deterministic, A",
     "deterministic, A and B",
     "PSGN, A",
@@ -142,7 +142,7 @@ def _record(chairs: list[OneArmedChair]) -> Metrics:
     found["side"] = torch.tensor([chair.side for chair in chairs])
     for arms in get_args(Arms):
         samples = np.stack([chair.samples(_TRUE_POINTS, arms) for chair in chairs])
-        found[f"{arms}, truth"] = torch.from_numpy(samples).float()
+        found[f"{arms}, target"] = torch.from_numpy(samples).float()
     return found
 
 
@@ -169,7 +169,7 @@ def _predict(study: Study, config: FitConfig, chairs: list[OneArmedChair], size:
 def _rows(found: Mapping[str, Metrics], chairs: Metrics, arms: Arms) -> dict[str, Tensor]:
     """Row -> its clouds (M, K, N, 3) of the chairs with these arms."""
     ours, plain, psgn = (found[name][arms] for name in _CHANGES)
-    true = chairs[f"{arms}, truth"][:, None]
+    true = chairs[f"{arms}, target"][:, None]
     errors = cloud_errors(psgn, true.expand(-1, 2, -1, -1).contiguous()).cd
     better = psgn[torch.arange(len(psgn)), errors.argmin(1)][:, None]
     joined, joined_plain = (clouds.flatten(1, 2)[:, None] for clouds in (ours, plain))
@@ -270,7 +270,7 @@ def _figure(
 ) -> Figure:
     """The first chairs, in pictures of `size` pixels, with the predictions of the first training (row -> (M, K, N, 3)),
     seen from above the missing arm; and the `shares` in its box and in that of the present one."""
-    columns = [PLAIN, PSGN, CODED, TWO, TRUTH]
+    columns = [PLAIN, PSGN, CODED, TWO, TARGET]
     shown = min(_SHOWN, len(chairs["number"]))
     figure, panels = figures.grid(rows=shown, columns=2 + len(columns))
     for number, line in enumerate(panels):
@@ -281,11 +281,11 @@ def _figure(
             figures.draw_image(axes, torch.from_numpy(image).permute(2, 0, 1).float() / 255)
         eye = orbit_camera(np.array([-20.0 * side]), np.array([35.0]), 128).to(dtype=torch.float32)
         boxes = chairs["boxes"][number].float()
-        close = figures.narrowed(eye, torch.cat([chairs["one, truth"][number], boxes.flatten(0, 1)]))[0]
+        close = figures.narrowed(eye, torch.cat([chairs["one, target"][number], boxes.flatten(0, 1)]))[0]
         for axes, name in zip(line[2:], columns, strict=True):
             cloud = clouds[name][number, 0]
             figures.draw_cloud(
-                axes, cloud, close, colours=figures.TRUE if name == TRUTH else figures.PREDICTED
+                axes, cloud, close, colours=figures.TRUE if name == TARGET else figures.PREDICTED
             )
             _mark(axes, cloud, boxes[0], close)
             missing, present = shares[name][0, number, 0, :2]

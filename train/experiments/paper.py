@@ -67,7 +67,7 @@ DIVERSITY = Table(
                 ("diversity loss, beta 10", unchanged, 3.36),
             )
         ),
-        Row(_RESAMPLED, source="truth", measure=ten_predictions, critic_of=with_critic),
+        Row(_RESAMPLED, source="target", measure=ten_predictions, critic_of=with_critic),
     ),
     claims=(
         below("diversity", "front constraint", "diversity loss, beta 10", times=3),
@@ -126,7 +126,7 @@ SINGLE_CATEGORY = Table(
         ),
         Row("ours, its training shapes, random codes", codes="random", split="train"),
         *(
-            Row(f"{name}, oracle", change=of_method(method), source="truth", measure=_oracle)
+            Row(f"{name}, oracle", change=of_method(method), source="target", measure=_oracle)
             for name, method, _ in _OTHERS
         ),
     ),

@@ -90,7 +90,7 @@ class Row:
     """See `InferenceConfig`; as the method has it if None."""
     split: Split = "test"
     """Which shapes; a claim can compare rows of one split only."""
-    source: Literal["network", "medoid", "nearest image", "truth"] = "network"
+    source: Literal["network", "medoid", "nearest image", "target"] = "network"
     """Of the clouds: a trained network, a retrieval baseline, or the ground truth (with a `measure` of its own)."""
     measure: Measure = reconstruction
     critic_of: Change | None = None

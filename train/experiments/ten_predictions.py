@@ -50,7 +50,7 @@ def ten_predictions(row: Row, study: Study, config: FitConfig) -> Metrics:
 
     def measured(name: str, inputs: list, function: Callable[[Source, LoadedSplit], Metrics]) -> Metrics:
         """Of the predictions of the row's network; or of samples of the ground truth in their place."""
-        if row.source == "truth":
+        if row.source == "target":
             test, source = (
                 study.split(config, "test"),
                 functools.partial(_samples, points=points, seed=config.seed),
