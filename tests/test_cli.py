@@ -210,7 +210,7 @@ def test_a_directory_of_that_name_goes_first(shipped: Path, picture: Path, tmp_p
 
 
 def test_help_of_everything_but_fit_does_not_load_torch() -> None:
-    commands = ["", "data", "data procedural", "reconstruct", "evaluate", "experiment", "demo"]
+    commands = ["", "data", "data procedural", "export", "reconstruct", "evaluate", "experiment", "demo"]
     code = f"""
 import os, sys
 os.environ.pop("OMP_WAIT_POLICY", None)

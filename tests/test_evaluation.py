@@ -16,6 +16,7 @@ from safetensors.torch import save_file
 import train
 from diffpoint import consistency_loss
 from models import PROFILES, Generator, build_generator
+from train.__main__ import main
 from train.config import InferenceConfig
 from train.data.batches import load_split
 from train.errors import UserError
@@ -412,8 +413,21 @@ def test_headers_of_earlier_versions_are_read_and_new_names_written(tmp_path: Pa
     assert all(torch.equal(value, model.state_dict()[name]) for name, value in old.state_dict().items())
 
 
-def test_the_shipped_weights_have_an_old_header_and_load() -> None:
-    assert "ending" in _header(Path(train.__file__).parent / "pretrained" / "generator.safetensors")
+def test_a_run_becomes_one_file_of_half_the_size(smoke_run: Path, tmp_path: Path) -> None:
+    whole, half = tmp_path / "whole.safetensors", tmp_path / "half.safetensors"
+    assert main(["export", str(smoke_run), "--out", str(whole)]) == 0
+    assert main(["export", str(smoke_run), "--out", str(half), "--half"]) == 0
+    assert half.stat().st_size < 0.55 * whole.stat().st_size
+    expected, exact, near = (train.load_generator(each) for each in (smoke_run, whole, half))
+    images, codes = torch.rand(2, 3, 48, 64), torch.randn(2, 2, expected.code_dim)
+    clouds = expected(images, codes)
+    assert torch.equal(exact(images, codes), clouds)
+    assert 0 < (near(images, codes) - clouds).abs().max() < 2e-3
+    assert main(["export", str(smoke_run), "--out", str(tmp_path / "weights.pt")]) == 2
+    assert not (tmp_path / "weights.pt").exists()
+
+
+def test_the_shipped_weights_load() -> None:
     model = train.load_generator("pretrained")
     assert model.config.output_head == "points"
     assert not model.training

@@ -1,4 +1,4 @@
-"""The command line: `python -m train data|fit|reconstruct|explore|evaluate|experiment|demo`."""
+"""The command line: `python -m train data|fit|reconstruct|explore|evaluate|export|experiment|demo`."""
 
 from __future__ import annotations
 
@@ -139,6 +139,24 @@ class Explore:
         from train.evaluation.reconstruct import explore_to_file
 
         explore_to_file(self.model, self.images, self.out, seed=self.seed)
+
+
+@dataclasses.dataclass
+class Export:
+    """Write the best weights of a run to one file, which can be used wherever a RUN is expected."""
+
+    model: Annotated[Positional[Path], arg(metavar="RUN")]
+    """A run's directory, a .safetensors file of one, or the word `pretrained`."""
+    out: Path
+    """The file; its name ends in .safetensors."""
+    half: bool = False
+    """Keep 16 bits of each number: half the size, and nearly the same predictions."""
+
+    def run(self) -> None:
+        from train.evaluation.runs import export_weights
+
+        export_weights(self.model, self.out, half=self.half)
+        print(f"wrote {self.out}, {self.out.stat().st_size / 1e6:.1f} MB")
 
 
 @dataclasses.dataclass
@@ -298,6 +316,7 @@ def _parse(arguments: list[str]) -> Any:
         | Annotated[Reconstruct, subcommand("reconstruct")]
         | Annotated[Explore, subcommand("explore")]
         | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Export, subcommand("export")]
         | Annotated[Experiment, subcommand("experiment")]
         | Annotated[Demo, subcommand("demo")]
     )

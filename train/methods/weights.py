@@ -61,10 +61,12 @@ def method_of(network: Predictor) -> Method:
     return next(method for method in map(get_method, METHODS) if type(network) is method.network_class)
 
 
-def save_weights(model: nn.Module, path: Path) -> None:
-    """Writes a network's weights and configuration, atomically."""
+def save_weights(model: nn.Module, path: Path, *, half: bool = False) -> None:
+    """Writes a network's weights and configuration, atomically; with `half` in float16, read back as float32."""
     name = _kinds()[type(model)].header
     tensors = {name: value.detach().contiguous() for name, value in model.state_dict().items()}
+    if half:
+        tensors = {name: v.half() if v.is_floating_point() else v for name, v in tensors.items()}
     config = getattr(model, "config", None)
     header = {name: json.dumps(dataclasses.asdict(config) if config else {})}
     with space_for(path), replacing(path) as temporary:
