@@ -5,6 +5,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from scipy.spatial import KDTree
 from trees import all_shapes, files_of
@@ -101,9 +102,26 @@ def test_variants_share_views_of_one_object(tmp_path):
     )
 
 
+def test_some_views_are_of_the_front_where_it_hides_something(tmp_path):
+    settings = SMALL | {"views": 4}
+    generate(tmp_path / "data", shapes=2, categories=["chair", "lamp"], fronts=3, **settings)
+    azimuths = {}
+    for shape in all_shapes(tmp_path / "data"):
+        eye = shape.camera.position
+        azimuths[shape.category] = torch.rad2deg(torch.atan2(eye[:, 0], eye[:, 2])).tolist()
+    cone = FAMILIES["chair"].cone
+    assert all(abs(azimuth) <= cone.azimuth_deg for azimuth in azimuths["chair"][:3])
+    assert len(set(azimuths["chair"])) == 4
+    around = sorted(azimuth % 90 for azimuth in azimuths["lamp"])
+    assert around[0] == pytest.approx(around[3], abs=1e-3)  # a quarter turn apart
+    with pytest.raises(UserError, match=r"other settings .*fronts"):
+        generate(tmp_path / "data", shapes=2, categories=["chair", "lamp"], fronts=1, **settings)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"fronts": 2}, "fronts must be between 0 and 1"),
         ({"categories": ["hat"]}, "hat.*there are: chair, display"),
         ({"categories": []}, "none given"),
         ({"shapes": 0}, "shapes must be between"),
