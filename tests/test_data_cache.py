@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import shutil
 import subprocess
@@ -19,8 +20,10 @@ from train.__main__ import main
 from train.data import Shape, ShapeTree, tree_files
 from train.data.batches import LoadedSplit, Sampler, load_split
 from train.data.cache import prepare
+from train.data.packed import PackedShape, PackedViews
 from train.data.shrink import Sizes, shrink
 from train.data.tree import _found_frame, read_shape
+from train.errors import UserError
 
 SIZES = Sizes((48, 64), 16)
 REPOSITORY = Path(__file__).parents[1]
@@ -36,24 +39,24 @@ def tree(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return root
 
 
-def _prepare(root: Path) -> dict[str, Shape]:
+def _prepare(root: Path) -> dict[str, PackedShape]:
     found = prepare(root, ShapeTree(root, "train").ids, SIZES, progress=False)
-    shapes = {name: shape for name, shape in found.items() if isinstance(shape, Shape)}
+    shapes = {name: shape for name, shape in found.items() if isinstance(shape, PackedShape)}
     assert len(shapes) == len(found)
     return shapes
 
 
-def _tensors(shape: Shape) -> tuple[torch.Tensor, ...]:
-    return shape.images, shape.depth, shape.camera.K, shape.camera.cam_from_world, shape.points
+def _tensors(shape: Shape | PackedShape) -> tuple[torch.Tensor, ...]:
+    return shape.images[:], shape.depth[:], shape.camera.K, shape.camera.cam_from_world, shape.points
 
 
-def _same(some: Shape, other: Shape) -> bool:
+def _same(some: Shape | PackedShape, other: Shape | PackedShape) -> bool:
     return all(
         a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(_tensors(some), _tensors(other), strict=True)
     )
 
 
-def _assert_fresh(shapes: dict[str, Shape], root: Path) -> None:
+def _assert_fresh(shapes: dict[str, PackedShape], root: Path) -> None:
     """They are what the tree's files give when they are read again."""
     assert list(shapes) == ShapeTree(root, "train").ids
     for name, shape in shapes.items():
@@ -65,6 +68,32 @@ def _assert_fresh(shapes: dict[str, Shape], root: Path) -> None:
 def _files(place: Path) -> dict[str, int]:
     """Prepared files and when they got their name."""
     return {path.stem: path.stat().st_ctime_ns for path in sorted(place.rglob("*.safetensors"))}
+
+
+VIEWS = {
+    "images": torch.randint(0, 256, (5, 3, 6, 8), dtype=torch.uint8),
+    "images, channels last": torch.randint(0, 9, (5, 6, 8, 3), dtype=torch.uint8).movedim(-1, 1),
+    "depth": torch.where(torch.rand(5, 7, 7) < 0.5, torch.inf, torch.rand(5, 7, 7)),
+    "no depth": torch.tensor([torch.nan, -torch.nan, -0.0, 1e-42]).expand(5, 3, 4),
+    "float64": torch.rand(5, 2, dtype=torch.float64),
+    "scalars": torch.arange(5),
+}
+SOME = torch.tensor([3, 0, 0, -1])
+INDICES = (2, -1, slice(None), slice(1, 4, 2), slice(0), SOME, SOME[:0], SOME.view(2, 2), torch.arange(5) > 2)
+
+
+@pytest.mark.parametrize("kind", VIEWS)
+def test_packed_views_are_indexed_as_the_tensor_is(kind: str) -> None:
+    views = VIEWS[kind]
+    packed = PackedViews.pack(views, "here")
+    assert packed.shape == views.shape
+    assert len(packed) == len(list(packed)) == 5
+    for index in INDICES:
+        unpacked, expected = packed[index], views[index]
+        assert (unpacked.dtype, unpacked.shape) == (expected.dtype, expected.shape)
+        assert unpacked.numpy().tobytes() == expected.numpy().tobytes()  # NaN and the sign of 0 too
+    with pytest.raises(IndexError):
+        packed[5]
 
 
 def test_prepared_shapes_are_made_once_and_mapped(tree: Path) -> None:
@@ -86,11 +115,44 @@ def test_prepared_shapes_are_made_once_and_mapped(tree: Path) -> None:
         ) >= len(first)
 
 
+def test_what_was_made_is_said_to_cost(tree: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train, val = (ShapeTree(tree, split).ids for split in ("train", "val"))
+    for made, total in ((train, len(train)), (val, len(train) + len(val))):
+        prepare(tree, made, SIZES, progress=False)
+        (place,) = (tree / ".prepared").iterdir()
+        size = sum(path.stat().st_size for path in place.rglob("*.safetensors"))
+        assert capsys.readouterr().err == f"{place}: {total} prepared shapes, {size / 1e6:.1f} MB\n"
+    (tree_files.render_folder(tree, train[0]) / "render_0.png").write_text("no picture")
+    prepare(tree, train, SIZES, progress=False)
+    prepare(tree, val, SIZES, progress=False)
+    assert "MB" not in capsys.readouterr().err  # nothing was made
+
+
+def test_what_an_earlier_version_has_prepared_is_deleted(
+    tree: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    decimated, pooled = (tree / ".prepared" / f"48x64-maps16-{pool}" for pool in ("decimate", "min"))
+    for place, version in ((decimated, 1), (decimated, 2), (decimated, 4), (pooled, 2)):
+        file = place.with_name(f"{place.name}-v{version}") / "03001627" / "a.safetensors"
+        file.parent.mkdir(parents=True)
+        file.write_bytes(bytes(100_000))
+        (file.parents[1] / ".lock").touch()
+    other = tree / ".prepared" / "48x64-maps16-decimate-v1" / "notes.txt"
+    other.write_text("mine")
+    _assert_fresh(_prepare(tree), tree)
+    said = capsys.readouterr().err
+    for version in (1, 2):
+        assert f"{decimated}-v{version}: 1 prepared shape, 0.1 MB of an earlier version deleted\n" in said
+    left = {path.name for path in (tree / ".prepared").iterdir()}
+    assert left == {f"{decimated.name}-v{version}" for version in (1, 3, 4)} | {f"{pooled.name}-v2"}
+    assert list(other.parent.iterdir()) == [other]
+
+
 def test_other_sizes_have_files_of_their_own(tree: Path) -> None:
     ids = ShapeTree(tree, "train").ids[:1]
     for sizes in (SIZES, Sizes((48, 64), 16, "min"), Sizes((24, 32), 16), Sizes((48, 64), 32)):
         (shape,) = prepare(str(tree), ids, sizes, progress=False).values()
-        assert isinstance(shape, Shape)
+        assert isinstance(shape, PackedShape)
         assert shape.images.shape[-2:] == sizes.image_size
         assert shape.depth.shape[-1] == shape.camera.height == sizes.map_size
     assert len(list((tree / ".prepared").rglob("*.safetensors"))) == 4
@@ -170,6 +232,28 @@ def test_damage_by_the_disk_is_found_by_data_check(tree: Path, capsys: pytest.Ca
     victim.unlink()
     _assert_fresh(_prepare(tree), tree)
     assert main(["data", "check", str(tree)]) == 0
+
+
+@pytest.mark.parametrize("tensor", ["images", "depth", "ends"])
+def test_damage_by_the_disk_is_found_when_a_batch_draws_the_view(tree: Path, tensor: str) -> None:
+    def draw() -> torch.Tensor:
+        split = load_split(tree, "train", image_size=(48, 64), map_size=16, progress=False)
+        batch = split.batch(torch.tensor([0]), torch.arange(split.views)[None])
+        return torch.cat([batch.images.flatten(), batch.depth.flatten()])
+
+    whole = draw()
+    (place,) = (tree / ".prepared").iterdir()
+    victim = place / f"{ShapeTree(tree, 'train').ids[0]}.safetensors"
+    written, content = victim.stat().st_mtime_ns, bytearray(victim.read_bytes())
+    start = 8 + int.from_bytes(content[:8], "little")
+    first, end = json.loads(content[8:start])[tensor]["data_offsets"]
+    content[start + (first + end) // 2] ^= 4
+    victim.write_bytes(content)
+    os.utime(victim, ns=(written, written))
+    with pytest.raises(UserError, match=rf"^{victim}: view \d cannot be decompressed .* Delete it and run"):
+        draw()
+    victim.unlink()
+    assert torch.equal(draw(), whole)
 
 
 def test_a_tree_that_cannot_be_written_to_is_prepared_elsewhere(
@@ -265,7 +349,7 @@ assert not any(name.split(".")[0] == "taichi" for name in sys.modules), "the ker
 
 
 def test_processes_that_start_together_make_each_file_once(tree: Path) -> None:
-    place = tree / ".prepared" / "48x64-maps16-decimate-v2"
+    place = tree / ".prepared" / "48x64-maps16-decimate-v3"
     place.mkdir(parents=True)
     with (place / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # as the process that makes them

@@ -107,7 +107,9 @@ def test_the_nearest_training_shape_by_image(
     assert all(index.tolist() == list(range(len(train))) for index in found.values())
     # Against all distances at once. The split twice: of equally near shapes the first counts.
     twice = dataclasses.replace(train, images=[*train.images] * 2, ids=train.ids * 2)
-    known, seen = (torch.stack(list(split.images)).flatten(2).double() / 255 for split in (twice, test))
+    known, seen = (
+        torch.stack([each[:] for each in split.images]).flatten(2).double() / 255 for split in (twice, test)
+    )
     distance = torch.cdist(seen.flatten(0, 1), known.flatten(0, 1)).view(len(test), 4, len(twice), 4).amin(3)
     for n, index in nearest_by_image(test, twice, views=(1, 2, 4)).items():
         assert index.tolist() == distance[:, :n].sum(1)[:, : len(train)].argmin(1).tolist()

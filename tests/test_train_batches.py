@@ -102,7 +102,8 @@ def test_several_trees_are_put_together_whatever_the_size_of_their_renders(
     ]
     assert both.ids == alone[0].ids + alone[1].ids
     assert torch.equal(
-        torch.stack([*both.depth]), torch.stack([depth for split in alone for depth in split.depth])
+        torch.stack([depth[:] for depth in both.depth]),
+        torch.stack([depth[:] for split in alone for depth in split.depth]),
     )
     few = load_split([tiny_data, other], "train", image_size=(48, 64), map_size=16, limit=4, progress=False)
     assert set(few.categories) == set(both.categories)

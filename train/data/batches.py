@@ -2,7 +2,7 @@
 
 Images are kept as bytes at the network's input size; depth maps at the size at which the front constraint
 compares, with cameras that fit the smaller maps exactly, so that prediction and observation share one camera. Both are
-mapped from files (train/data/cache.py): a batch reads the pages of its own views.
+compressed (train/data/packed.py) and mapped from files (train/data/cache.py): a batch reads its own views only.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from diffpoint import PinholeCamera
 from train.data.cache import prepare
-from train.data.shape import Shape
+from train.data.packed import PackedShape, PackedViews
 from train.data.shrink import Pool, Sizes
 from train.data.tree import ShapeTree
 from train.errors import UserError
@@ -34,8 +34,8 @@ class LoadedSplit:
     """M shapes with V views each.
 
     Attributes:
-        images: M of (V, 3, h, w) uint8 at the network's input size.
-        depth: M of (V, S, S) float32 metric depth, +inf where empty.
+        images: M of (V, 3, h, w) uint8, packed or a tensor, at the network's input size.
+        depth: M of (V, S, S) float32, packed or a tensor: metric depth, +inf where empty.
         K: (M, V, 3, 3) intrinsics for maps of S x S pixels.
         cam_from_world: (M, V, 4, 4).
         points: (M, P, 3) ground truth in the world frame.
@@ -43,8 +43,8 @@ class LoadedSplit:
         categories: category name of every shape.
     """
 
-    images: Sequence[Tensor] | Tensor
-    depth: Sequence[Tensor] | Tensor
+    images: Sequence[PackedViews] | Tensor
+    depth: Sequence[PackedViews] | Tensor
     K: Tensor
     cam_from_world: Tensor
     points: Tensor
@@ -92,7 +92,7 @@ class LoadedSplit:
         return self.points[shapes[:, None], points]
 
 
-def _picked(values: Sequence[Tensor] | Tensor, shapes: Tensor, views: Tensor) -> Tensor:
+def _picked(values: Sequence[PackedViews] | Tensor, shapes: Tensor, views: Tensor) -> Tensor:
     """M of (V, ...), (B,) shape and (B, V') view numbers -> (B, V', ...)."""
     return torch.stack([values[shape][chosen] for shape, chosen in zip(shapes.tolist(), views, strict=True)])
 
@@ -166,12 +166,12 @@ def load_split(
         for tree in trees:
             start, tree.ids = start + len(tree), [name for i, name in enumerate(tree.ids, start) if i in kept]
     sizes = Sizes(image_size, map_size, gt_pool)
-    shapes: list[Shape] = []
+    shapes: list[PackedShape] = []
     for tree in trees:
         prepared = prepare(tree.path, tree.ids, sizes, name=split, progress=progress)
         for name in tree.ids:
             small = prepared[name]
-            if isinstance(small, Shape):
+            if isinstance(small, PackedShape):
                 shapes.append(small)
             else:
                 tree.skipped[name] = str(small)

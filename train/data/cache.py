@@ -1,11 +1,12 @@
 """Shapes at the sizes of training, kept on disk: pictures are decoded once, and all processes map the same files.
 
-    TREE/.prepared/96x128-maps28-decimate-v2/<synset>/<model>.safetensors
+    TREE/.prepared/96x128-maps28-decimate-v3/<synset>/<model>.safetensors
 
-A file holds the tensors of one shape and, in its header, from which files it was made (their names, sizes and times),
-its own time, and a checksum. When it is opened, its size, its time and the files that it was made from are compared;
-one that does not fit is made again. The checksum, which needs every byte, is left to `python -m train data check`:
-tensors are mapped, and read from the disk when a batch needs them.
+A file holds the tensors of one shape, its images and depth maps compressed view by view (train/data/packed.py). Its
+header says from which files it was made (their names, sizes and times), its own time, and a checksum. When it is
+opened, its size, its time and the files that it was made from are compared; one that does not fit is made again. The
+checksum, which needs every byte, is left to `python -m train data check`: tensors are mapped, and read from the disk
+when a batch needs them.
 
 A tree that cannot be written to has its files in the user's cache folder, and the environment variable
 DIFFPOINT_PREPARED names a folder for all trees. The files can be deleted at any time.
@@ -21,11 +22,12 @@ import tempfile
 import time
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -34,22 +36,23 @@ from tqdm import tqdm
 from diffpoint.camera import PinholeCamera
 from train.data.categories import category_of
 from train.data.layouts import layout_of
-from train.data.shape import Shape, ShapeError
+from train.data.packed import PackedShape, PackedViews
+from train.data.shape import ShapeError
 from train.data.shrink import Sizes, shrink
 from train.data.tree import frame_of, read_shape
 from train.errors import UserError
 from train.files import replacing
 from train.processes import map_unordered, progress_bar
 
-_VERSION = 2  # of the files, and of how shapes are shrunk
-_TENSORS = ("images", "depth", "K", "cam_from_world", "points")
+_VERSION = 3  # of the files, and of how shapes are shrunk
+_TENSORS = ("images", "depth", "ends", "K", "cam_from_world", "points")
 _PLACE = "DIFFPOINT_PREPARED"
 _SHAPES_PER_PROCESS = 100  # starting one takes seconds
 
 
 def prepare(
     root: str | Path, shapes: Sequence[str], sizes: Sizes, *, name: str = "shapes", progress: bool = True
-) -> dict[str, Shape | ShapeError]:
+) -> dict[str, PackedShape | ShapeError]:
     """The shapes of a tree, shrunk: from their prepared files, which are made where they are missing.
 
     A process that is killed while it makes them loses only the shapes on which it was working; of several that start
@@ -63,8 +66,8 @@ def prepare(
         progress: show progress bars.
 
     Returns:
-        In the order of `shapes`: shapes as `shrink` returns them, with tensors that are mapped from the files, or why
-        a shape cannot be read.
+        In the order of `shapes`: shapes as `shrink` returns them, packed, with tensors that are mapped from the files,
+        or why a shape cannot be read.
 
     Raises:
         UserError: `sizes` do not fit the renders.
@@ -75,11 +78,11 @@ def prepare(
     tree = _Tree(root, sizes, " ".join(repr(np.asarray(turn, float).tolist()) for turn in turns))
     (height, width), side, pool = sizes.image_size, sizes.map_size, sizes.pool
     places = [folder / f"{height}x{width}-maps{side}-{pool}-v{_VERSION}" for folder in _folders(root)]
-    found: dict[str, Shape | ShapeError] = {}
+    found: dict[str, PackedShape | ShapeError] = {}
     unusable: Counter[str] = Counter()
     for shape in progress_bar(shapes, title=f"opening {name}", unit="shape", progress=progress, leave=False):
         result = _open(places, tree, shape)
-        if isinstance(result, Shape):
+        if isinstance(result, PackedShape):
             found[shape] = result
         elif result:
             unusable[result] += 1
@@ -92,10 +95,16 @@ def prepare(
         with _one_at_a_time(place):
             # Another process may have made them while this one waited.
             found |= {
-                shape: small for shape in missing if isinstance(small := _open(places, tree, shape), Shape)
+                shape: packed
+                for shape in missing
+                if isinstance(packed := _open(places, tree, shape), PackedShape)
             }
-            missing = [shape for shape in missing if shape not in found]
-            found |= _make(place, tree, missing, name=name, progress=progress)
+            if missing := [shape for shape in missing if shape not in found]:
+                _remove_earlier_versions(place)
+                made = _make(place, tree, missing, name=name, progress=progress)
+                found |= made
+                if any(isinstance(each, PackedShape) for each in made.values()):
+                    _print(f"{place}: {_in_words(list(place.glob('*/*.safetensors')))}")
     missing = [shape for shape in missing if shape not in found]  # those whose files could not be kept
     for shape in progress_bar(
         missing, title=f"reading {name}", unit="shape", progress=progress and bool(missing)
@@ -141,9 +150,9 @@ class _Tree(NamedTuple):
             lines = [str(error)]  # reading the shape fails with a better message
         return hashlib.sha256("\n".join([self.frame, *lines]).encode()).hexdigest()[:32]
 
-    def read(self, shape: str) -> Shape:
-        """The shape from its pictures, shrunk."""
-        return shrink(read_shape(self.root, shape), self.sizes)
+    def read(self, shape: str) -> PackedShape:
+        """The shape from its pictures, shrunk and packed."""
+        return PackedShape.pack(shrink(read_shape(self.root, shape), self.sizes))
 
 
 def _line(name: str, stat: os.stat_result) -> str:
@@ -196,7 +205,7 @@ def _one_at_a_time(place: Path) -> Iterator[None]:
         yield
 
 
-def _open(places: Sequence[Path], tree: _Tree, shape: str) -> Shape | str:
+def _open(places: Sequence[Path], tree: _Tree, shape: str) -> PackedShape | str:
     """A shape from the first place that has a file that fits; else what is wrong with a file, "" if there is none."""
     source, reason = tree.source(shape), ""
     for place in places:
@@ -212,10 +221,12 @@ def _open(places: Sequence[Path], tree: _Tree, shape: str) -> Shape | str:
         if about.get("source") != source or changed:
             reason = reason or ("outdated" if about.get("source") != source else "damaged")
             continue
-        size = tensors["depth"].shape[-1]
+        size, ends = tree.sizes.map_size, tensors["ends"]
+        images = PackedViews(tensors["images"], ends[0], (3, *tree.sizes.image_size), torch.uint8, str(path))
+        depth = PackedViews(tensors["depth"], ends[1], (size, size), torch.float32, str(path))
         camera = PinholeCamera(tensors["K"], tensors["cam_from_world"], size, size)
         category = category_of(shape.split("/")[0])
-        return Shape(tensors["images"], tensors["depth"], camera, tensors["points"], shape, category)
+        return PackedShape(images, depth, camera, tensors["points"], shape, category)
     return reason
 
 
@@ -248,12 +259,12 @@ class _Job(NamedTuple):
 
 def _make(
     place: Path, tree: _Tree, shapes: Sequence[str], *, name: str, progress: bool
-) -> dict[str, Shape | ShapeError]:
+) -> dict[str, PackedShape | ShapeError]:
     """Makes the files of `shapes`, as many as there is room for, and maps them."""
     for leftover in place.glob("*/.*.tmp"):  # of a process that was killed
         leftover.unlink(missing_ok=True)
     jobs = [_Job(place, tree, shape) for shape in shapes]
-    made: dict[str, Shape | ShapeError] = {}
+    made: dict[str, PackedShape | ShapeError] = {}
     results = map_unordered(
         _make_one,
         jobs,
@@ -275,7 +286,7 @@ def _make(
                 _print(f"prepared shapes cannot be kept in {place} ({result}); see {_PLACE}")
                 break
     for shape in shapes:
-        if shape not in made and isinstance(opened := _open([place], tree, shape), Shape):
+        if shape not in made and isinstance(opened := _open([place], tree, shape), PackedShape):
             made[shape] = opened
     return made
 
@@ -284,9 +295,10 @@ def _make_one(job: _Job) -> UserError | str:
     """Makes one file, perhaps in a worker process; returns why it could not be written, "" if it is there."""
     try:
         source = job.tree.source(job.shape)  # first, so that a change while it is read is noticed later
-        small = job.tree.read(job.shape)
-        K, cam_from_world = small.camera.K, small.camera.cam_from_world
-        values = (small.images, small.depth, K, cam_from_world, small.points)
+        packed = job.tree.read(job.shape)
+        ends = torch.stack((packed.images.ends, packed.depth.ends))  # (2, V)
+        K, cam_from_world = packed.camera.K, packed.camera.cam_from_world
+        values = (packed.images.data, packed.depth.data, ends, K, cam_from_world, packed.points)
         tensors = {name: value.contiguous() for name, value in zip(_TENSORS, values, strict=True)}
         # The file gets this time, in whole seconds, which every file system and copy keeps: a later change shows.
         written = int(time.time()) * 10**9
@@ -302,6 +314,36 @@ def _make_one(job: _Job) -> UserError | str:
     except OSError as error:
         return error.strerror or str(error)
     return ""
+
+
+def _remove_earlier_versions(place: Path) -> None:
+    """Deletes what earlier versions of this program prepared at the same sizes; other files beside it stay."""
+    for version in range(1, _VERSION):
+        old = place.with_name(place.name.removesuffix(str(_VERSION)) + str(version))
+        files = list(old.glob("*/*.safetensors"))
+        if not files:
+            continue
+        try:
+            with _one_at_a_time(old):
+                found = _in_words(files)
+                for path in (*files, *old.glob("*/.*.tmp"), old / ".lock"):
+                    path.unlink(missing_ok=True)
+        except OSError as error:  # another user's, or on Windows in use
+            _print(f"{old}: made by an earlier version and not used any more; delete it ({error.strerror})")
+            continue
+        with contextlib.suppress(OSError):  # there are other files
+            for folder in (*{path.parent for path in files}, old):
+                folder.rmdir()
+        _print(f"{old}: {found} of an earlier version deleted")
+
+
+def _in_words(files: Collection[Path]) -> str:
+    """How many prepared shapes, and what they take."""
+    size = sum(path.stat().st_size for path in files)
+    shapes = "shape" if len(files) == 1 else "shapes"
+    return f"{len(files)} prepared {shapes}, " + (
+        f"{size / 1e9:.1f} GB" if size >= 1e8 else f"{size / 1e6:.1f} MB"
+    )
 
 
 def _print(text: str) -> None:

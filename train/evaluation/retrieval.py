@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -44,13 +45,13 @@ def nearest_by_image(test: LoadedSplit, train: LoadedSplit, *, views: Sequence[i
     """
     smallest = {n: torch.full((len(test),), torch.inf) for n in views}
     nearest = {n: torch.zeros(len(test), dtype=torch.int64) for n in views}
-    chunk = max(1, _CHUNK_BYTES // (4 * train.images[0].numel()))
+    chunk = max(1, _CHUNK_BYTES // (4 * math.prod(train.images[0].shape)))
     for first in range(0, len(train), chunk):
         shapes = range(first, min(first + chunk, len(train)))
-        known = torch.cat([train.images[shape] for shape in shapes]).flatten(1).float() / 255
+        known = torch.cat([train.images[shape][:] for shape in shapes]).flatten(1).float() / 255
         known_squared = known.square().sum(1)
         for row, images in enumerate(test.images):
-            seen = images.flatten(1).float() / 255
+            seen = images[:].flatten(1).float() / 255
             squared = seen.square().sum(1)[:, None] + known_squared - 2 * seen @ known.T
             distance = squared.clamp(min=0).sqrt().unflatten(1, (len(shapes), -1)).amin(2)
             for n in views:
