@@ -26,8 +26,8 @@ from train.show import figures, pages
 from train.show.report import shipped_weights_section
 from train.training.trainer import fit
 
-# A fifth of the profile's steps: about five minutes on two cores, and enough for more views to lower the error.
-DEMO_CONFIG = scaled(recipe("ours", "cpu", "whole-shapes"), 0.2)
+# A sixth of the profile's steps: about six minutes on two cores, and enough for more views to lower the error.
+DEMO_CONFIG = scaled(recipe("ours", "cpu", "whole-shapes"), 0.175)
 _RENDER_SIZE = 112
 _CATEGORIES = ("chair", "display")  # learnt in so short a training
 
@@ -41,7 +41,7 @@ _CODES = 3
 def demo(
     out: str | Path,
     *,
-    shapes: int = 240,
+    shapes: int = 160,
     seed: int = 0,
     config: FitConfig = DEMO_CONFIG,
     progress: bool = True,

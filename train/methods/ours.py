@@ -277,24 +277,17 @@ def whole_shapes(config: FitConfig) -> FitConfig:
     2020); relaxed as by Rupprecht et al., "Learning in an uncertain world" (ICCV 2017).
     """
 
-    def stage(stage: StageConfig, **settings: Any) -> StageConfig:
-        settings = {
-            "front": "chamfer",
-            "beta": 0.0,
-            "gamma": 0.0,
-            "shape_weight": 2.0,
-            "shape_relaxation": 0.1,
-        } | settings
-        return dataclasses.replace(stage, **settings)
-
+    changes: dict[str, Any] = {
+        "codes": 5, "front": "chamfer", "beta": 0.0, "gamma": 0.0, "shape_weight": 2.0, "shape_relaxation": 0.1,
+    }  # fmt: skip
     return dataclasses.replace(
         config,
         recipe="whole-shapes",
         points_per_cell=4,
         group_norm=True,
         augmentation=1.0,
-        stage1=stage(config.stage1, codes=min(5, config.stage1.codes + 2)),
-        stage2=stage(config.stage2, codes=min(5, config.stage2.codes + 1)),
+        stage1=dataclasses.replace(config.stage1, **changes),
+        stage2=dataclasses.replace(config.stage2, **changes),
     )
 
 
