@@ -187,8 +187,8 @@ _CLI = (
 
 
 def _fit_command(data: Path, run: Path, *options: str, largest_file: int = 0) -> list[str]:
-    command = ["fit", "--data", str(data), "--out", str(run), "--profile", "smoke", *options]
-    return [sys.executable, "-c", _CLI, str(largest_file), *command]
+    command = ["fit", "--data", str(data), "--out", str(run), "--profile", "smoke", "--recipe", "paper"]
+    return [sys.executable, "-c", _CLI, str(largest_file), *command, *options]
 
 
 @pytest.mark.slow
@@ -544,7 +544,19 @@ def test_two_processes_descend_as_one(tiny_data: Path, smoke_run: Path, tmp_path
 @pytest.mark.slow
 def test_two_processes_train_write_once_and_resume(tiny_data: Path, tmp_path: Path) -> None:
     """A run of two processes that stops and goes on ends in the bits of one that does not."""
-    fit_it = ["-m", "train", "fit", "--data", tiny_data, "--profile", "smoke", "--stage1.shapes", "4"]
+    fit_it = [
+        "-m",
+        "train",
+        "fit",
+        "--data",
+        tiny_data,
+        "--profile",
+        "smoke",
+        "--recipe",
+        "paper",
+        "--stage1.shapes",
+        "4",
+    ]
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     _torchrun(*fit_it, "--out", whole)
     _torchrun(*fit_it, "--out", parts)
