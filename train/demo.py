@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import torch
-
 from train.config import FitConfig, scaled
 from train.data import Shape, ShapeTree
 from train.data.procedural import generate
@@ -18,6 +16,7 @@ from train.data.tree_files import SPLITS, render_folder
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate
 from train.evaluation.examples import make_example, report_run
+from train.evaluation.inference import predict
 from train.evaluation.reconstruct import explore_to_file, read_pictures, reconstruct_to_files
 from train.evaluation.runs import PRETRAINED, best_weights, open_run
 from train.files import write_text
@@ -128,18 +127,16 @@ def _shipped_weights(out: Path, *, seed: int) -> list[str]:
     unseen.sort(key=lambda shape: _UNSEEN_CATEGORIES.index(shape.category))
     examples = [make_example(model, shape, config, seed=seed, codes=_CODES) for shape in unseen]
     photographed, links = [], {}
-    for path in sorted(_PHOTOGRAPHS.glob("*.png")):
-        picture = read_pictures([path])
-        codes = torch.randn(_CODES, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
-        with torch.no_grad():
-            clouds = model(picture, codes)[:, 0]
-        photographed.append(figures.Photographed(path.stem, picture, clouds, clouds[0]))
     for example, shape in zip(examples, unseen, strict=True):
         if shape.category in ("chair", "sofa"):
             front = render_folder(data, shape.id) / f"render_{example.chosen}.png"
             links[f"an unseen {shape.category}"] = _explorer(out, shape.category, front, seed=seed)
-    for path in sorted(_PHOTOGRAPHS.glob("sedan.png")):
-        links["the photograph of a car"] = _explorer(out, path.stem, path, seed=seed)
+    for path in sorted(_PHOTOGRAPHS.glob("*.png")):
+        picture = read_pictures([path])
+        clouds = predict(model, picture[0], _CODES, seed=seed)
+        photographed.append(figures.Photographed(path.stem, picture, clouds, clouds[0]))
+        if path.stem == "sedan":
+            links["the photograph of a car"] = _explorer(out, path.stem, path, seed=seed)
     section = shipped_weights_section(examples, photographed, links)
     page = pages.page(
         "What the shipped weights answer", section, subtitle="A small network of its own is next."

@@ -341,9 +341,8 @@ class _Files(FilePathResolver):
             path = Path(self.parent, candidate).resolve()
             if path.is_relative_to(self._root) and path.is_file():
                 return path.read_bytes()
-        paints = (
-            Path(self.parent).resolve().parent / "Textures"
-        )  # FlightGear: in it is a folder for each airline
+        # FlightGear's paints: in this folder is one for each airline.
+        paints = Path(self.parent).resolve().parent / "Textures"
         for path in sorted(paints.rglob(glob.escape(name.rpartition("/")[2]))):
             if path.is_relative_to(self._root) and path.is_file():
                 return path.read_bytes()

@@ -12,7 +12,7 @@ from models import Predictor
 from train.config import FitConfig, fit_config_from_json
 from train.data import Shape, ShapeTree
 from train.errors import UserError
-from train.evaluation.inference import reconstruct
+from train.evaluation.inference import predict, reconstruct
 from train.evaluation.runs import load_predictor, read_metrics
 from train.show import figures
 from train.show.report import write_report
@@ -73,8 +73,7 @@ def make_example(
     """Predictions from the image that shows a shape's front best, and a reconstruction from all images."""
     # Objects face +z, so that this view does not show their back.
     chosen = int(shape.camera.position[:, 2].argmax())
-    drawn = torch.randn(codes, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
-    predictions = model(shape.images[chosen : chosen + 1], drawn)[:, 0]
+    predictions = predict(model, shape.images[chosen], codes, seed=seed)
     found = reconstruct(model, shape.images, seed=seed, settings=config.inference)
     images, camera = figures.close_up(shape.images, shape.camera, shape.points)
     return figures.Example(images, camera, chosen, predictions, found.points[0], shape.points)

@@ -96,6 +96,13 @@ def reconstruct(
     return Reconstruction(torch.cat(points), torch.cat(codes), history, torch.cat(kept))
 
 
+@torch.no_grad()
+def predict(model: Predictor, image: Tensor, count: int, *, seed: int) -> Tensor:
+    """(R, N, 3): a network's predictions for one image (3, H, W) with `count` random codes."""
+    codes = torch.randn(count, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
+    return model(image[None], codes)[:, 0].contiguous()
+
+
 def _check(settings: InferenceConfig) -> None:
     if settings.groups < 1 or settings.steps < 0 or settings.patience < 0:
         raise ValueError(

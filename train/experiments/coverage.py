@@ -27,6 +27,7 @@ from train.data.procedural import variants_of
 from train.data.render import Renderer, orbit_camera
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
+from train.evaluation.inference import predict
 from train.evaluation.runs import open_run
 from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.paper import without_codes
@@ -288,13 +289,6 @@ def _predicted(study: Study, network: _Network, objects: Sequence[Object], codes
     return _over_objects(
         [_judge(obj, predict(model, obj.image, max(codes), seed=network.seed), codes) for obj in bar]
     )
-
-
-@torch.no_grad()
-def predict(model: Predictor, image: Tensor, count: int, *, seed: int) -> Tensor:
-    """(R, N, 3): a network's predictions for one image (3, H, W) with `count` random codes."""
-    codes = torch.randn(count, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
-    return model(image[None], codes)[:, 0].contiguous()
 
 
 def _without_network(study: Study, config: FitConfig, points: int, objects: Sequence[Object]) -> Metrics:

@@ -22,9 +22,8 @@ from train.data.cutout import cut_out
 from train.data.images import is_cut_out, read_rgba
 from train.data.photos import Photo, find_photos
 from train.errors import UserError
-from train.evaluation.inference import reconstruct
+from train.evaluation.inference import predict, reconstruct
 from train.evaluation.reconstruct import MOST_IMAGES, read_pictures
-from train.experiments.coverage import predict
 from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.statistics import spread, stacked, trainings
 from train.experiments.store import Metrics

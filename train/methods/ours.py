@@ -75,14 +75,13 @@ def generator_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) ->
     if beta > 0:
         views = batch.depth.shape[1]
         diversity = diversity_term(noise.codes, clouds, stage, views=views, step=step.number)
-    timer.mark("distances")
 
     # Of the predictions of an image, the nearest to the whole shape: each code may choose another shape.
     shape, shape_statistics = torch.zeros(()), {}
     if stage.shape_weight > 0:
         targets = for_each_image(targets_of(batch).points, batch)
         shape, shape_statistics = nearest_prediction_loss(clouds, targets, stage, step=step.number)
-        timer.mark("distances")
+    timer.mark("distances")
 
     # The critic learns to tell the latents of predictions from those of real shapes; then it judges the predictions.
     critic, critic_statistics = torch.zeros(()), {}
@@ -282,7 +281,6 @@ def whole_shapes(config: FitConfig) -> FitConfig:
     Sources: Li et al., "Multimodal image synthesis with conditional implicit maximum likelihood estimation" (IJCV
     2020); relaxed as by Rupprecht et al., "Learning in an uncertain world" (ICCV 2017).
     """
-
     changes: dict[str, Any] = {
         "codes": 5, "front": "chamfer", "beta": 0.0, "gamma": 0.0, "shape_weight": 2.0, "shape_relaxation": 0.1,
     }  # fmt: skip

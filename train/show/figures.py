@@ -195,14 +195,10 @@ def photographs_figure(objects: Sequence[Photographed]) -> Figure:
     count = len(objects[0].predictions)
     last = ["from all pictures", "from behind"] if most > 1 else ["code 1, from behind"]
     figure, panels = grid(rows=len(objects), columns=shown + count + len(last))
-    eye = torch.tensor([[0.94, 0.68, 1.63]])  # 30 degrees to the side, 20 up
-    front = PinholeCamera.look_at(eye, focal_px=240.0, height=128, width=128)
-    camera = PinholeCamera(
-        front.K.repeat(2, 1, 1),
-        torch.cat([front.cam_from_world, from_behind(front).cam_from_world]),
-        128,
-        128,
-    )
+    eyes = torch.tensor(
+        [[0.94, 0.68, 1.63], [-0.94, 0.68, -1.63]]
+    )  # 30 degrees to the side, 20 up; and opposite
+    camera = PinholeCamera.look_at(eyes, focal_px=240.0, height=128, width=128)
     for line, each in zip(panels, objects, strict=True):
         for axes in line[:shown]:
             bare(axes)
