@@ -5,6 +5,7 @@ from models.critic import Critic, critic_loss, generator_loss, gradient_penalty
 from models.generator import Generator, Prediction, build_generator
 from models.predictor import Predictor
 from models.sizes import CODE_DIM, PROFILES, GeneratorConfig
+from models.widen import widen
 
 __all__ = [
     "CODE_DIM",
@@ -22,4 +23,5 @@ __all__ = [
     "critic_loss",
     "generator_loss",
     "gradient_penalty",
+    "widen",
 ]

@@ -10,6 +10,7 @@ import trimesh
 from PIL import Image
 from trees import all_shapes
 
+from diffpoint.io import read_points
 from train.data import tree_files
 from train.data.mesh_sources import (
     UPRIGHT,
@@ -248,6 +249,34 @@ def test_meshes_without_a_label_are_made_too_and_leave_the_split_of_the_others(t
         assert (few / "03001627.list").read_text() == (everything / "03001627.list").read_text()
     with pytest.raises(UserError, match="give labels too"):
         convert([tmp_path / "lib"], tmp_path / "none", unlabelled=True, **SMALL)
+
+
+def test_stretched_copies_are_other_shapes_in_the_split_of_their_mesh(tmp_path):
+    for number in range(12):
+        save_box(tmp_path / "lib" / f"m{number}" / "model.obj", (1.0, 1.0, 1.0))
+    plain, more = tmp_path / "plain", tmp_path / "more"
+    convert([tmp_path / "lib"], plain, **SMALL)
+    convert([tmp_path / "lib"], more, options=MeshOptions(stretched=1), **SMALL)
+    report = convert([tmp_path / "lib"], more, options=MeshOptions(stretched=2), **SMALL)
+    assert (report.made, report.kept) == (12, 24)
+    for split in tree_files.SPLITS:
+        few, everything = (
+            (tree / tree_files.LISTS / split / "unknown.list").read_text().split() for tree in (plain, more)
+        )
+        assert sorted(everything) == sorted(
+            name + copy for name in few for copy in ("", "_stretched1", "_stretched2")
+        )
+    clouds = [read_points(tree_files.cloud_file(more, f"unknown/m0{copy}")) for copy in ("", "_stretched1")]
+    cube, box = (cloud.amax(0) - cloud.amin(0) for cloud in clouds)
+    assert cube.max() - cube.min() < 0.02 < box.max() - box.min()
+    assert abs(box.norm() - 1) < 0.02
+    cameras = [
+        (tree_files.render_folder(more, f"unknown/m0{copy}") / "camera_0.json").read_text()
+        for copy in ("", "_stretched1", "_stretched2")
+    ]
+    assert len(set(cameras)) == 3
+    with pytest.raises(UserError, match="stretched must be between 0 and 99; got -1"):
+        convert([tmp_path / "lib"], more, options=MeshOptions(stretched=-1), **SMALL)
 
 
 def test_labels_that_fit_nothing_or_are_none(tmp_path):

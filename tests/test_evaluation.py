@@ -286,6 +286,22 @@ def test_one_view_has_nothing_to_agree_with(model: Generator, images: torch.Tens
     assert found.points.shape == (2, model.points, 3)
 
 
+def test_of_one_view_s_predictions_the_medoid_is_kept(model: Generator, images: torch.Tensor) -> None:
+    settings = InferenceConfig(groups=7, medoid=True)
+    found = reconstruct(model, images[:, :1], settings=settings, seed=3)
+    drawn = torch.randn(7, 2, 1, model.code_dim, generator=torch.Generator().manual_seed(3))[:, :, 0]
+    clouds = model(images[:, 0], drawn).detach()
+    for image in range(2):
+        distances = [
+            sum(100 * consistency_loss(torch.stack([a, b])).item() for b in clouds[:, image] if b is not a)
+            for a in clouds[:, image]
+        ]
+        torch.testing.assert_close(found.codes[image, 0], drawn[distances.index(min(distances)), image])
+    first = reconstruct(model, images[:, :1], settings=dataclasses.replace(settings, medoid=False), seed=3)
+    torch.testing.assert_close(first.codes[:, 0], drawn[0])
+    assert not torch.equal(first.codes, found.codes)
+
+
 def test_a_deterministic_network_has_nothing_to_choose(images: torch.Tensor) -> None:
     plain = build_generator("smoke", deterministic=True)
     found = reconstruct(plain, images)

@@ -103,7 +103,11 @@ def test_a_name_of_no_method_is_refused_with_the_names_of_all() -> None:
         ("psgn", {"variant": "highly-diverse"}, "does not support"),
         ("psgn", {"precision": "bfloat16"}, "computes in float32"),
         ("psgn", {"recipe": "whole-shapes"}, "has no recipe whole-shapes; leave --recipe at paper"),
-        ("psgn", {"points_per_cell": 4}, "has a network and a loss of its own; do not set --points"),
+        (
+            "psgn",
+            {"points_per_cell": 4},
+            "has a network and a loss of its own; do not set --decoder-width, --points",
+        ),
         ("ptn", {"stage2": recipe("ptn", "smoke").stage1}, "has no stage2; leave its steps at 0"),
     ],
 )

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from diffpoint import PinholeCamera, splat_depth
-from models import CODE_DIM, PROFILES, GeneratorConfig, Predictor, build_generator
+from models import CODE_DIM, PROFILES, GeneratorConfig, Predictor, build_generator, widen
 from models.baselines import (
     Baseline,
     R2N2Config,
@@ -246,6 +246,33 @@ def test_more_points_in_each_cell_are_more_points_of_both_branches() -> None:
     model = build_generator(config=dataclasses.replace(PROFILES["smoke"], points_per_cell=4))
     clouds = model(torch.rand(1, 3, 48, 64), torch.randn(2, 1, CODE_DIM))
     assert clouds.shape[2] == model.points == 2 * PROFILES["smoke"].points
+
+
+@pytest.mark.parametrize("group_norm", [False, True])
+def test_a_wider_network_starts_as_the_narrower_one_and_learns_more(group_norm: bool) -> None:
+    torch.manual_seed(0)
+    size = dataclasses.replace(PROFILES["smoke"], decoder_width=0.5, group_norm=group_norm)
+    narrow, wide = (build_generator(config=dataclasses.replace(size, decoder_width=w)) for w in (0.5, 1.0))
+    widen(wide, narrow)
+    images, codes = torch.rand(2, 3, 48, 64), torch.randn(3, 2, CODE_DIM)
+    torch.testing.assert_close(wide(images, codes), narrow(images, codes), atol=1e-6, rtol=1e-5)
+    # The repeats of a channel get different gradients, even after Adam has made them as large.
+    optimiser = torch.optim.Adam(wide.parameters(), lr=1e-3)
+    wide(images, codes).square().sum().backward()
+    optimiser.step()
+    weight = wide.decoder.down5[0].weight
+    first, second = weight.unflatten(0, (2, -1)).unbind()
+    assert (first != second).float().mean() > 0.2
+
+
+def test_only_multiples_can_be_widened() -> None:
+    layers = [torch.nn.Linear(2, 4), torch.nn.Linear(2, 6), torch.nn.Conv1d(2, 4, 1), torch.nn.Linear(2, 2)]
+    with pytest.raises(ValueError, match="no multiple"):
+        widen(layers[1], layers[0])
+    with pytest.raises(ValueError, match="other layers"):
+        widen(layers[2], layers[0])
+    with pytest.raises(ValueError, match="no multiple"):
+        widen(layers[3], layers[0])
 
 
 def test_wrong_sizes_are_named() -> None:

@@ -350,7 +350,26 @@ def test_a_training_starts_with_the_weights_of_another(
     assert "holds the weights of another network" in capsys.readouterr().err
     assert main([*fit_it, str(tmp_path / "nowhere"), "--out", str(tmp_path / "none")]) == 2
     assert "does not exist" in capsys.readouterr().err
+    pretrained = [
+        "fit",
+        "--data",
+        str(tiny_data),
+        "--start",
+        "pretrained",
+        "--out",
+        str(tmp_path / "smaller"),
+    ]
+    assert (
+        main([*pretrained, "--profile", "smoke"]) == 2
+    )  # whose layers are fractions of the pretrained one's
+    assert "holds the weights of another network" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+    # A wider decoder starts with the same predictions.
+    wider = Trainer(dataclasses.replace(config, decoder_width=2), train_split).state.network
+    images, codes = torch.rand(1, 3, 48, 64), torch.randn(1, 1, wider.code_dim)
+    torch.testing.assert_close(
+        wider(images, codes), load_generator(start)(images, codes), atol=1e-6, rtol=1e-5
+    )
     # A run that has begun does not need them any more.
     copy = Path(shutil.copy(start, tmp_path / "start.safetensors"))
     assert main([*fit_it, str(copy), "--out", str(tmp_path / "run")]) == 0

@@ -157,6 +157,9 @@ class InferenceConfig:
 
     groups: int = 5
     """Groups of codes drawn per shape; the most consistent one is kept."""
+    medoid: bool = False
+    """With a single image, which has no other to agree with: return the prediction with the smallest mean chamfer
+    distance to those of the other groups, instead of the first group's."""
     steps: int = 30
     """Gradient steps on the kept codes."""
     step_size: float = 0.5
@@ -201,6 +204,8 @@ class FitConfig:
     output_head: OutputHead = "points"
     """What the generator predicts: points (the released network), or a latent of the auto-encoder, whose frozen
     decoder makes the points (the network of the paper's text)."""
+    decoder_width: int = 1
+    """Multiple of the profile's number of channels, where the network reads image and code together."""
     points_per_cell: int = 2
     """Points that the generator predicts in each cell of its feature grid; the paper's network has 2. The numbers of
     points above belong to 2, and grow in proportion."""

@@ -71,6 +71,9 @@ class Meshes:
     scale: float | None = None
     """World units per unit of the files, to keep relative sizes; by default each mesh is scaled to a bounding box with
     the diagonal 1."""
+    stretched: int = 0
+    """How many more shapes to make of each mesh, stretched along its three axes by random factors from 0.74 to 1.35;
+    they are in the split of their mesh."""
     drop_hidden: bool = False
     """Leave out ground-truth points that are visible neither in a view nor from anywhere outside."""
     size: int = 224
@@ -102,7 +105,7 @@ class Meshes:
             views=self.views,
             seed=self.seed,
             processes=self.processes,
-            options=MeshOptions(self.category, self.up, self.scale, self.drop_hidden, orbit),
+            options=MeshOptions(self.category, self.up, self.scale, self.drop_hidden, self.stretched, orbit),
         )
         print(report.summary())
 

@@ -83,8 +83,8 @@ def write_lists(root: str | Path, *, seed: int) -> dict[str, dict[str, int]]:
     """Splits the shapes on disk into train, val and test (about 70/10/20) and writes the lists.
 
     The split depends on the seed and the shape's own name, so that it stays when shapes are added. Hidden
-    variants of one object, named `<object>_h<k>`, stay together. From five objects on, each category has at least
-    one object in val and in test.
+    variants of one object, named `<object>_h<k>`, and stretched copies, `<object>_stretched<k>`, stay together. From
+    five objects on, each category has at least one object in val and in test.
 
     Returns:
         Counts, by split and synset.
@@ -109,7 +109,7 @@ def split_shapes(shapes: Iterable[str], *, seed: int) -> dict[str, str]:
     """The split of each shape of one category; see `write_lists`."""
     objects: dict[str, list[str]] = defaultdict(list)
     for shape in shapes:
-        objects[re.sub(r"_h\d+$", "", shape)].append(shape)
+        objects[re.sub(r"_(h|stretched)\d+$", "", shape)].append(shape)
     fraction = {name: hash_fraction(f"{seed}:{name}") for name in objects}
     order = sorted(objects, key=lambda name: fraction[name])
     split_of = {

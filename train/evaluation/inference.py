@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffpoint import consistency_loss
+from diffpoint import chamfer_distance, consistency_loss
 from models import Predictor
 from train.config import InferenceConfig
 
@@ -48,6 +48,9 @@ def reconstruct(
     settings: InferenceConfig | None = None,
 ) -> Reconstruction:
     """Draws groups of random codes, keeps each object's most consistent group, and minimises the loss over its codes.
+
+    A single image has nothing to be consistent with: the result is the prediction of the first code, or with
+    `settings.medoid` that nearest to those of all codes.
 
     Args:
         model: the network; its parameters are not changed. One without codes predicts once.
@@ -122,9 +125,12 @@ def _reconstruct(
     """(B, V, 3, H, W) images and (G, B, V, D) candidate codes, all in memory at once."""
     shapes, views = images.shape[:2]
     if views == 1 or not model.takes_codes:
-        points = model.predict_views(images, candidates[0]).flatten(1, 2)
+        codes = candidates[0]
+        if settings.medoid and settings.groups > 1 and model.takes_codes:
+            codes = candidates[_medoid(model, images[:, 0], candidates[:, :, 0]), torch.arange(shapes)]
+        points = model.predict_views(images, codes).flatten(1, 2)
         no_history = torch.zeros(0, shapes)
-        return Reconstruction(points, candidates[0], no_history, torch.zeros(shapes, dtype=torch.int64))
+        return Reconstruction(points, codes, no_history, torch.zeros(shapes, dtype=torch.int64))
     with torch.no_grad():
         features = model.encode(images.flatten(0, 1)).unflatten(0, (shapes, views))
         codes = candidates[0]
@@ -134,6 +140,17 @@ def _reconstruct(
             ]
             codes = candidates[torch.stack(scores).argmin(0), torch.arange(shapes)]
     return _descend(model, features, codes, settings)
+
+
+@torch.no_grad()
+def _medoid(model: Predictor, images: Tensor, codes: Tensor) -> Tensor:
+    """(B, 3, H, W) images, (G, B, D) codes -> (B,) the code whose prediction is nearest to all the others."""
+    clouds = model(images, codes)
+    distances = torch.zeros(len(codes), *clouds.shape[:2])
+    for other in range(1, len(codes)):
+        pair = chamfer_distance(clouds[:other], clouds[other].expand(other, -1, -1, -1), squared=False)
+        distances[:other, other] = distances[other, :other] = pair.a_to_b + pair.b_to_a
+    return distances.sum(1).argmin(0)
 
 
 def _decode(model: Predictor, features: Tensor, codes: Tensor) -> Tensor:

@@ -155,10 +155,11 @@ class Method(ABC):
                 f"{name} does not support a critic, the latent output head, the deterministic counterpart or variants; "
                 "do not set --output-head, --deterministic, --variant or --stage*.gamma"
             )
-        if config.points_per_cell != 2 or config.group_norm or any(s.shape_weight for s in config.stages):
+        other_network = config.decoder_width != 1 or config.points_per_cell != 2 or config.group_norm
+        if other_network or any(stage.shape_weight for stage in config.stages):
             raise UserError(
-                f"{name} has a network and a loss of its own; do not set --points-per-cell, --group-norm or "
-                "--stage*.shape-weight"
+                f"{name} has a network and a loss of its own; do not set --decoder-width, --points-per-cell, "
+                "--group-norm or --stage*.shape-weight"
             )
         if config.precision != "float32":
             raise UserError(f"{name} computes in float32; do not set --precision")

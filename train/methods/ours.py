@@ -178,8 +178,10 @@ class Ours(Method):
         return highly_diverse(config) if name == "highly-diverse" else config
 
     def network_config(self, config: FitConfig) -> GeneratorConfig:
+        size = SIZES[config.profile]
         return dataclasses.replace(
-            SIZES[config.profile],
+            size,
+            decoder_width=size.decoder_width * config.decoder_width,
             deterministic=config.deterministic,
             output_head=config.output_head,
             occupancy_logits=config.occupancy_logits,
@@ -268,7 +270,7 @@ PROFILES = {
 # Codes that choose between shapes are worth a search. On 48 validation shapes (one seed), CD with 2 and 8 views and
 # FPS-CD with 8: random codes 4.57, 3.89, 6.22; 5 groups and 10 steps of 0.1 4.25, 3.61, 5.13; 20 groups and 10 steps of
 # 0.3 4.27, 3.53, 4.89.
-_INFERENCE_WHOLE_SHAPES = InferenceConfig(groups=20, steps=20, step_size=0.3, keep_best=True)
+_INFERENCE_WHOLE_SHAPES = InferenceConfig(groups=20, medoid=True, steps=20, step_size=0.3, keep_best=True)
 
 
 def whole_shapes(config: FitConfig) -> FitConfig:

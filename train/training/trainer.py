@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from models import widen
 from train.config import FitConfig, PretrainConfig, StageConfig, fit_config_from_json, to_json
 from train.data.augment import augment
 from train.data.batches import Batch, LoadedSplit, Sampler
@@ -300,13 +301,17 @@ class Trainer:
             state.optimiser = adam(self.trained_network.train().requires_grad_(True))
 
     def _load_weights(self, run_or_file: Path) -> None:
-        found = load_predictor(run_or_file)
+        """Takes the weights of a network that differs at most in having a narrower decoder."""
+        found, network = load_predictor(run_or_file), self.state.network
+        sizes = [dataclasses.asdict(of.config) | {"decoder_width": None} for of in (found, network)]
         try:
-            self.state.network.load_state_dict(found.state_dict())
-        except RuntimeError:
+            if type(found) is not type(network) or sizes[0] != sizes[1]:
+                raise ValueError("other networks")
+            widen(network, found)
+        except ValueError:
             raise UserError(
                 f"{run_or_file} holds the weights of another network than the one to be trained (--system, --profile, "
-                "--output-head, --deterministic); start from one of the same kind"
+                "--output-head, --deterministic); start from one of the same kind, whose decoder may be narrower"
             ) from None
 
     def _load_autoencoder(self, run: Path) -> None:
