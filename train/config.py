@@ -332,6 +332,28 @@ def to_json(config: FitConfig, *, data: str | Path | Sequence[str | Path]) -> st
     return json.dumps({"data": trees, **dataclasses.asdict(config)}, indent=2) + "\n"
 
 
+def changed_settings(config: Any) -> dict[str, Any]:
+    """A configuration as plain JSON values, without the fields that are at their defaults.
+
+    It is what experiments know their trainings and measurements by: a new field, at its default, changes nothing. Who
+    changes a default raises `TRAINING_VERSION`.
+
+    Args:
+        config: an instance of any dataclass; so may be its fields.
+    """
+    changed: dict[str, Any] = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if value != field.default:
+            nested = dataclasses.is_dataclass(value)
+            changed[field.name] = changed_settings(value) if nested else _plain(value)
+    return changed
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(each) for each in value] if isinstance(value, tuple) else value
+
+
 def fit_config_from_json(text: str, *, where: str) -> FitConfig:
     """Reads a run's config.json: the fields of FitConfig, and beside them "data".
 

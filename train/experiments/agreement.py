@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from scipy.stats import sem
 
 from diffpoint import consistency_loss
-from train.config import FitConfig, InferenceConfig
+from train.config import FitConfig, InferenceConfig, changed_settings
 from train.data.batches import LoadedSplit
 from train.errors import UserError
 from train.evaluation.per_shape import METRICS, concatenate, evaluate_split, stack_seeds
@@ -140,7 +140,7 @@ def _measured(study: Study, run: Path, what: _Measurement) -> Metrics:
         return stack_seeds([evaluate(code_seed=draw) for draw in code_seeds])
 
     # The name of a run is not enough: any run can be given, and one that trains on gets other weights.
-    parts = [dataclasses.asdict(settings), views, seed, code_seeds, test.fingerprint]
+    parts = [changed_settings(settings), views, seed, code_seeds, test.fingerprint]
     return study.kept(["agreement", weights_digest(opened.model), *parts], measure)
 
 

@@ -6,7 +6,6 @@ cloud's points in the box where the missing arm would be, relative to that of a 
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 from collections.abc import Mapping
@@ -19,7 +18,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from diffpoint import PinholeCamera, project
-from train.config import FitConfig
+from train.config import FitConfig, changed_settings
 from train.data import ShapeTree
 from train.data.ambiguity_check import ambiguous_object
 from train.data.categories import SYNSET_OF
@@ -91,7 +90,7 @@ def make(study: Study) -> Outcome:
         found: dict[str, Metrics] = {}
         for name, change in _CHANGES.items():
             config = study.config(change, seed=seed)
-            key = [*which, *study.weights_key(config), dataclasses.asdict(config.inference), size, CODES]
+            key = [*which, *study.weights_key(config), changed_settings(config.inference), size, CODES]
             found[name] = study.kept(key, lambda config=config: _predict(study, config, drawn(), size))
         clouds.append({arms: _rows(found, chairs, arms) for arms in get_args(Arms)})
     shares = stacked([_shares(rows, chairs) for rows in clouds])

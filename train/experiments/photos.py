@@ -6,7 +6,6 @@ descent.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from train.config import FitConfig
+from train.config import FitConfig, changed_settings
 from train.data.cutout import cut_out
 from train.data.images import is_cut_out, read_rgba
 from train.data.photos import Photo, find_photos
@@ -133,7 +132,7 @@ def _reconstruct(study: Study, config: FitConfig, found: PhotographedObject) -> 
         return {"one": one, "agreed": agreed.points[0].contiguous(), "losses": losses}
 
     pictures = hashlib.sha256(found.pictures.numpy().tobytes()).hexdigest()
-    settings = dataclasses.asdict(config.inference)
+    settings = changed_settings(config.inference)
     return study.kept(["photos", *study.weights_key(config), settings, CODES, pictures], measure)
 
 

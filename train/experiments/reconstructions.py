@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -11,7 +10,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from train.config import FitConfig
+from train.config import FitConfig, changed_settings
 from train.data.batches import LoadedSplit
 from train.data.tree import read_shape
 from train.evaluation.inference import reconstruct
@@ -101,7 +100,7 @@ def _reconstruct(study: Study, config: FitConfig, chosen: Tensor, views: Tensor)
         thinned = cloud_errors(thin_out(points, model.points), true)
         return {"points": points.contiguous(), "cd": cloud_errors(points, true).cd, "fps_cd": thinned.cd}
 
-    settings = dataclasses.asdict(config.inference)
+    settings = changed_settings(config.inference)
     key = ["reconstructions", *study.weights_key(config), settings, chosen.tolist(), views.tolist()]
     return study.kept([*key, test.fingerprint], measure)
 

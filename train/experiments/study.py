@@ -21,7 +21,14 @@ from typing import Any, Literal
 import torch
 
 from models import Predictor
-from train.config import FitConfig, InferenceConfig, Profile, fit_config_from_json, with_steps
+from train.config import (
+    FitConfig,
+    InferenceConfig,
+    Profile,
+    changed_settings,
+    fit_config_from_json,
+    with_steps,
+)
 from train.data.batches import LoadedSplit
 from train.errors import UserError
 from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate, evaluate_split
@@ -133,7 +140,7 @@ class Study:
 
     def run_key(self, config: FitConfig) -> dict[str, Any]:
         """All that decides the weights of a training, but for the seed."""
-        fields = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_OF_THE_WEIGHTS}
+        fields = {k: v for k, v in changed_settings(config).items() if k not in _NOT_OF_THE_WEIGHTS}
         return {"config": fields, "data": self.fingerprints(), "training_version": TRAINING_VERSION}
 
     def run_of(self, config: FitConfig) -> Path:
@@ -253,7 +260,7 @@ class Study:
         def evaluate(model: Predictor, data: LoadedSplit) -> Metrics:
             return evaluate_split(model, data, settings, views=views, seed=config.seed, code_seed=code_seed)
 
-        what = [dataclasses.asdict(settings), views, *([] if code_seed is None else [code_seed])]
+        what = [changed_settings(settings), views, *([] if code_seed is None else [code_seed])]
         return self.measure(config, what, evaluate, stage=stage, split=split)
 
     def retrieval_metrics(
