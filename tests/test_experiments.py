@@ -80,7 +80,7 @@ def test_a_run_is_found_by_its_configuration(fresh: Study) -> None:
 
 def test_defaults_are_those_by_which_kept_results_are_known() -> None:
     """Keys leave out what is at its default. If you have only added a field, put the new digest here. If you have
-    changed a default, also raise TRAINING_VERSION, or results of the old default would be taken for those of the new one."""
+    changed a default, also raise TRAINING_VERSION: else results of the old default pass for those of the new one."""
     defaults = {
         settings.__name__: store.digest(
             {
