@@ -18,7 +18,7 @@ _Gradients = dict[str, torch.Tensor]
 
 
 def one_step_each(data: Path, run: Path, world: World) -> dict[str, torch.Tensor]:
-    """Losses and gradients of a step of each stage from fresh weights and `run`'s auto-encoder, by name."""
+    """Losses and gradients of a step of each stage, with every loss, from fresh weights and `run`'s auto-encoder."""
     smoke = recipe("ours", "smoke")
     split = load_split(data, "train", image_size=(48, 64), map_size=16, progress=False)
     found: dict[str, torch.Tensor] = {}
@@ -26,7 +26,8 @@ def one_step_each(data: Path, run: Path, world: World) -> dict[str, torch.Tensor
         stage = dataclasses.replace(
             stage, shapes=4, views=2, codes=2, diversity_images=4, ramp=(0, 1), n_critic=2, real_pool=1
         )
-        trainer = Trainer(dataclasses.replace(smoke, stage1=stage), split, world)
+        stage = dataclasses.replace(stage, shape_weight=1.0, shape_relaxation=0.1)
+        trainer = Trainer(dataclasses.replace(smoke, stage1=stage, augmentation=1.0), split, world)
         trainer.begin_phase("stage1", run)
         trainer.step = 5
         state, critic_steps = trainer.state, []

@@ -28,25 +28,27 @@ _SPOILT_SHARE = 0.5
 _WHITE = 0.98
 
 
-def augment(images: Tensor, strength: float, random: torch.Generator) -> Tensor:
+def augment(images: Tensor, strength: float, seeds: Tensor) -> Tensor:
     """Changes light, colour, sharpness, size and place of each image at random.
 
     Args:
         images: (B, 3, H, W) in [0, 1] on white.
         strength: 0 changes nothing; 1 is as much as photographs need.
-        random: generator on the CPU; the same state gives the same changes.
+        seeds: (B,) int64, one for each image: what happens to an image does not depend on those beside it.
 
     Returns:
         (B, 3, H, W) in [0, 1].
     """
 
+    numbers, noise = _random_numbers(images, seeds)
+    unused = iter(numbers.unbind(1))
+
     def draw(most: float, *shape: int, signed: bool = True) -> Tensor:
-        drawn = torch.rand(len(images), *shape, generator=random)
-        return (strength * most * (2 * drawn - 1 if signed else drawn)).to(images.device)
+        drawn = torch.stack([next(unused) for _ in range(math.prod(shape))], 1).view(-1, *shape)
+        return strength * most * (2 * drawn - 1 if signed else drawn)
 
     def sometimes(values: Tensor) -> Tensor:
-        chosen = torch.rand(len(images), generator=random) < _SPOILT_SHARE
-        return torch.where(chosen.to(values.device), values, 0)
+        return torch.where(next(unused) < _SPOILT_SHARE, values, 0)
 
     images = _move(images, shift=draw(_SHIFT, 2), scale=1 + draw(_SCALE), turn=draw(_TURN))
     empty = (images.amin(1, keepdim=True) >= _WHITE).to(images.dtype)
@@ -60,9 +62,18 @@ def augment(images: Tensor, strength: float, random: torch.Generator) -> Tensor:
     )
     images = empty * background + (1 - empty) * light
     images = _blur(images, sometimes(draw(_BLUR, signed=False)))
-    noise = torch.randn(images.shape, generator=random).to(images.device)
     images = images + sometimes(draw(_NOISE, signed=False))[:, None, None, None] * noise
     return _compress(images, sometimes(draw(_QUANTISATION, signed=False))).clamp(0, 1)
+
+
+def _random_numbers(images: Tensor, seeds: Tensor) -> tuple[Tensor, Tensor]:
+    """Uniform in [0, 1) (B, 64), more than are used, and normal of the images' shape: an image's from its own seed."""
+    uniform, normal = [], []
+    for seed in seeds.tolist():
+        generator = torch.Generator().manual_seed(seed)
+        uniform.append(torch.rand(64, generator=generator))
+        normal.append(torch.randn(images.shape[1:], generator=generator))
+    return torch.stack(uniform).to(images.device), torch.stack(normal).to(images.device)
 
 
 def _move(images: Tensor, *, shift: Tensor, scale: Tensor, turn: Tensor) -> Tensor:

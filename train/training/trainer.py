@@ -260,7 +260,8 @@ class Trainer:
             real = [self._clouds(shapes), *(self._draw_clouds(phase.shapes) for _ in range(phase.real_pool))]
             batch = batch._replace(real=shard(torch.stack(real), 1))
         if self.config.augmentation > 0:
-            changed = augment(batch.images.flatten(0, 1), self.config.augmentation, self._random)
+            seeds = shard(torch.randint(2**62, (images,), generator=self._random))
+            changed = augment(batch.images.flatten(0, 1), self.config.augmentation, seeds)
             batch = batch._replace(images=changed.view(batch.images.shape))
         if self.method.needs_targets(phase):
             batch = batch._replace(targets=self._train.targets(shard(shapes)))
