@@ -486,6 +486,26 @@ def test_one_page_of_all_results(fresh: Study) -> None:
         write_page(fresh.out / "metrics")
 
 
+def test_the_recipe_of_whole_shapes_has_results_of_its_own_beside_the_paper_s(fresh: Study) -> None:
+    other = dataclasses.replace(fresh, recipe="whole-shapes")
+    configs = [study.config(unchanged, seed=0) for study in (fresh, other)]
+    assert [config.recipe for config in configs] == ["paper", "whole-shapes"]
+    assert fresh.run_of(configs[0]) != other.run_of(configs[1])
+    # Methods that have one recipe are trained once for both.
+    psgn = [study.run_of(study.config(of_method("psgn"), seed=0)) for study in (fresh, other)]
+    assert psgn[0] == psgn[1]
+    make_all({"views": _experiment()}, fresh)
+    assert make_all({"views": _experiment()}, other) == ["views"]
+    assert make_all({"views": _experiment()}, fresh) == []
+    text = write_page(fresh.out).read_text()
+    places = [text.index(f"\n{words}\n") for words in ("## views", "## views, recipe whole-shapes")]
+    assert places == sorted(places)
+    papers, others = text[places[0] : places[1]], text[places[1] :]
+    assert "out/views.png" in papers and "whole-shapes" not in papers
+    assert "out/whole-shapes-views.png" in others and "--recipe whole-shapes" in others
+    assert "| whole-shapes-views | a < b |" in text
+
+
 def test_the_published_page_is_made_of_the_published_results(tmp_path: Path) -> None:
     docs = Path(__file__).parents[1] / "docs"
     shutil.copytree(docs / "results", tmp_path / "results")

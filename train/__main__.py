@@ -20,7 +20,7 @@ import tyro
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 from tyro.constructors import PrimitiveConstructorSpec
 
-from train.config import FitConfig, Profile, fit_config_from_json, renamed_options, with_steps
+from train.config import FitConfig, Profile, Recipe, fit_config_from_json, renamed_options, with_steps
 from train.data_commands import Data
 from train.errors import UserError
 from train.experiments.registry import ABOUT_ALL, EXPERIMENTS, FORMER_NAMES
@@ -236,7 +236,9 @@ class Experiment:
     """Root of a data tree; several are put together for training, and the first one's test split is measured (collapse:
     each on its own)."""
     profile: Literal["full", "cpu", "smoke"] = "cpu"
-    """Size of the networks, and how they are trained."""
+    """Size of the networks, and how long they are trained."""
+    recipe: Recipe = "paper"
+    """How our method is trained, see `fit`. Files of the recipe of whole shapes are named whole-shapes-NAME."""
     seeds: int = 3
     """Trainings of each system; for agreement, choices of codes and views."""
     limit: int | None = None
@@ -261,7 +263,7 @@ class Experiment:
         processes = os.cpu_count() or 1 if self.processes is None else self.processes
         study = Study(
             self.data, self.out, self.profile, self.seeds, self.limit, self.steps, processes=processes,
-            category=self.category, pictures=self.pictures, run=self.run_, views=self.views,
+            category=self.category, pictures=self.pictures, run=self.run_, views=self.views, recipe=self.recipe,
         )  # fmt: skip
         if self.name == "list":
             print_status(study)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from train.config import FitConfig
 from train.experiments import store
-from train.experiments.study import Study
+from train.experiments.study import Study, file_stem
 from train.files import write_text
 from train.show import figures
 
@@ -52,20 +52,20 @@ def markdown_page(*blocks: str | Sequence[str]) -> str:
 
 
 def make_experiment(name: str, experiment: Experiment, study: Study) -> dict[str, Any]:
-    """Makes an experiment and writes NAME.json, NAME.md and its figures into `study.out`; returns what NAME.json
-    holds."""
-    outcome = experiment.make(study)
+    """Makes an experiment and writes STEM.json, STEM.md and its figures into `study.out`, see `file_stem`; returns what
+    STEM.json holds."""
+    outcome, stem = experiment.make(study), file_stem(name, study.recipe)
     result = outcome.result | {"made_from": made_from(experiment, study)}
     for ending, figure in outcome.figures.items():
-        figures.save(figure, study.out / f"{name}{ending}.png")
-    write_text(study.out / f"{name}.md", outcome.page)
-    write_text(study.out / f"{name}.json", json.dumps(result, indent=2) + "\n")
+        figures.save(figure, study.out / f"{stem}{ending}.png")
+    write_text(study.out / f"{stem}.md", outcome.page)
+    write_text(study.out / f"{stem}.json", json.dumps(result, indent=2) + "\n")
     return result
 
 
 def is_done(name: str, experiment: Experiment, study: Study) -> bool:
     """Is an experiment's result there, of just these trainings, data, seeds and limits?"""
-    paths = [study.out / f"{name}.{kind}" for kind in ("json", "md", "png")]
+    paths = [study.out / f"{file_stem(name, study.recipe)}.{kind}" for kind in ("json", "md", "png")]
     if not all(path.exists() for path in paths):
         return False
     return json.loads(paths[0].read_text()).get("made_from") == made_from(experiment, study)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from train.config import Recipe
 from train.errors import UserError
 from train.experiments import store
 from train.experiments.registry import EXPERIMENTS
 from train.experiments.statistics import CLAIM_ALIGNMENT, CLAIM_COLUMNS, LEVEL, claim_cells, counted
+from train.experiments.study import file_stem
 from train.files import write_text
 from train.show.tables import markdown_lines
 
@@ -41,28 +44,34 @@ def write_page(out: Path) -> Path:
         store.pack(folder)
         if folder != out:
             lines += ["", f"## Data: {folder.name}", "", _text(folder / "README.md")]
-        for name, result in found.items():
-            lines += ["", f"{'##' if folder == out else '###'} {name}", "", f"*{EXPERIMENTS[name]}*", ""]
-            lines += [_section(folder, name, result, page.parent)]
+        for (name, recipe), result in found.items():
+            title = name if recipe == "paper" else f"{name}, recipe {recipe}"
+            lines += ["", f"{'##' if folder == out else '###'} {title}", "", f"*{EXPERIMENTS[name]}*", ""]
+            lines += [_section(folder, name, recipe, result, page.parent)]
     write_text(page, "\n".join([*lines, ""]))
     return page
 
 
-def _results(folder: Path) -> dict[str, dict[str, Any]]:
-    """Name -> what NAME.json holds, in the order of the registry."""
-    return {
-        name: json.loads((folder / f"{name}.json").read_text())
-        for name in EXPERIMENTS
-        if (folder / f"{name}.json").exists() and (folder / f"{name}.md").exists()
-    }
+_Results = Mapping[tuple[str, Recipe], dict[str, Any]]
+"""Name and recipe of an experiment -> what its JSON file holds."""
 
 
-def _summary(groups: Mapping[Path, Mapping[str, Mapping[str, Any]]]) -> list[str]:
+def _results(folder: Path) -> _Results:
+    """The results in a folder, in the order of the registry."""
+    found = {}
+    for name, recipe in itertools.product(EXPERIMENTS, get_args(Recipe)[::-1]):
+        stem = file_stem(name, recipe)
+        if (folder / f"{stem}.json").exists() and (folder / f"{stem}.md").exists():
+            found[name, recipe] = json.loads((folder / f"{stem}.json").read_text())
+    return found
+
+
+def _summary(groups: Mapping[Path, _Results]) -> list[str]:
     """All claims of all experiments with their verdicts; those of single categories are in the tables alone."""
     claims = [
-        (folder.name, name, claim)
+        (folder.name, file_stem(*which), claim)
         for folder, found in groups.items()
-        for name, result in found.items()
+        for which, result in found.items()
         for claim in result.get("claims", ())
     ]
     several = len(groups) > 1
@@ -80,16 +89,18 @@ def _summary(groups: Mapping[Path, Mapping[str, Mapping[str, Any]]]) -> list[str
     return [words, "", *markdown_lines(head, rows, "l" * (len(head) - len(CLAIM_COLUMNS)) + CLAIM_ALIGNMENT)]
 
 
-def _section(folder: Path, name: str, result: Mapping[str, Any], beside: Path) -> str:
+def _section(folder: Path, name: str, recipe: Recipe, result: Mapping[str, Any], beside: Path) -> str:
     """An experiment's page, the comments on it, its figures, and the command that makes it again."""
-    parts = [(folder / f"{name}.md").read_text().strip(), _text(folder / f"{name}.reading.md")]
-    for picture in sorted(folder.glob(f"{name}.png")) + sorted(folder.glob(f"{name}-*.png")):
+    stem = file_stem(name, recipe)
+    parts = [(folder / f"{stem}.md").read_text().strip(), _text(folder / f"{stem}.reading.md")]
+    for picture in sorted(folder.glob(f"{stem}.png")) + sorted(folder.glob(f"{stem}-*.png")):
         parts.append(f"![{picture.stem}]({picture.relative_to(beside).as_posix()})")
     if "profile" in result:
         data = " ".join(Path(root).name for root in result.get("data", ()))
         pictures = f" --pictures {Path(result['pictures']).name}" if "pictures" in result else ""
+        options = "" if recipe == "paper" else f"--recipe {recipe} "
         parts.append(
-            f"`python -m train experiment {name} --data {data} --out OUT --profile {result['profile']} "
+            f"`python -m train experiment {name} --data {data} --out OUT --profile {result['profile']} {options}"
             f"--seeds {result['seeds']}{pictures}`"
         )
     return "\n\n".join(part for part in parts if part)

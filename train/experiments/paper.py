@@ -14,7 +14,7 @@ from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatena
 from train.experiments.store import Metrics
 from train.experiments.study import Change, Study, after_stage1, of_method, unchanged
 from train.experiments.table import Claim, Row, Table, below, falls_more, rising
-from train.experiments.ten_predictions import ten_predictions
+from train.experiments.ten_predictions import best_of_ten, ten_predictions
 from train.methods import get_method
 from train.methods.ours import highly_diverse
 
@@ -181,6 +181,23 @@ DETERMINISTIC = Table(
     category_claims=(below("cd", "conditional", "deterministic"),),
 )
 
+ONE_IMAGE = Table(
+    title="Do latent codes lower the error of what one image gives?",
+    rows=(
+        Row("conditional", views=1),
+        Row("conditional, random codes", views=1, codes="random"),
+        Row("conditional, best of ten codes", views=1, measure=best_of_ten),
+        Row("deterministic", change=without_codes, views=1),
+        Row("nearest training shape by image", views=1, source="nearest image"),
+    ),
+    claims=(
+        below("cd", "conditional", "deterministic"),
+        below("cd", "conditional, best of ten codes", "deterministic"),
+        below("cd", "conditional", "nearest training shape by image"),
+    ),
+    category_claims=(below("cd", "conditional", "deterministic"),),
+)
+
 CRITIC = Table(
     title="Does the latent critic lower the error?",
     rows=(
@@ -287,9 +304,10 @@ VIEWS = Table(
 
 TABLES = {
     "diversity": DIVERSITY, "single-category": SINGLE_CATEGORY, "multi-category": MULTI_CATEGORY,
-    "deterministic": DETERMINISTIC, "ablation": ABLATION, "consistency": CONSISTENCY, "views": VIEWS, "critic": CRITIC,
+    "deterministic": DETERMINISTIC, "one-image": ONE_IMAGE, "ablation": ABLATION, "consistency": CONSISTENCY,
+    "views": VIEWS, "critic": CRITIC,
 }  # fmt: skip
 
-diversity, single_category, multi_category, deterministic, ablation, consistency, views = (
+diversity, single_category, multi_category, deterministic, one_image, ablation, consistency, views = (
     table.experiment for name, table in TABLES.items() if name != "critic"
 )

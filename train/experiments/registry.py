@@ -13,6 +13,7 @@ EXPERIMENTS = {
     "single-category": "five methods on the shapes of one --category, eight views",
     "multi-category": "one network for all categories: ours, PSGN and 3D-R2N2, by category",
     "deterministic": "our method with and without latent codes",
+    "one-image": "our method with and without latent codes, from one image",
     "ablation": "effect of stage 1, stage 2, its diversity loss, search and descent",
     "consistency": "search and descent on the highly diverse model",
     "correlation": "correlation of consistency loss and error, over shapes and over groups of codes",
@@ -33,7 +34,7 @@ EXPERIMENTS = {
 
 _MODULES = {
     **dict.fromkeys(("diversity", "single-category", "multi-category", "deterministic"), "paper"),
-    **dict.fromkeys(("ablation", "consistency", "views"), "paper"),
+    **dict.fromkeys(("one-image", "ablation", "consistency", "views"), "paper"),
     "front-vs-projection": "front_vs_projection.experiment",
 }
 """Where an experiment is that has no module of its own name."""

@@ -12,13 +12,13 @@ from train.experiments.frame import Experiment, is_done, make_experiment
 from train.experiments.page import write_page
 from train.experiments.registry import EXPERIMENTS, load
 from train.experiments.status import duration, need_trees, status, status_lines
-from train.experiments.study import Study
+from train.experiments.study import Study, file_stem
 
 __all__ = ["Study", "make_all", "print_status", "run_all", "run_experiment", "write_page"]
 
 
 def run_experiment(name: str, study: Study) -> dict[str, Any]:
-    """Makes one experiment of the registry, prints its page, and returns what NAME.json holds.
+    """Makes one experiment of the registry, prints its page, and returns what its JSON file holds.
 
     Raises:
         UserError: no usable data, an unknown run, or numbers out of range.
@@ -27,7 +27,7 @@ def run_experiment(name: str, study: Study) -> dict[str, Any]:
         raise UserError(f"the experiment {name} trains its own networks; leave --run out")
     result = make_experiment(name, load(name), study)
     if study.progress:
-        print((study.out / f"{name}.md").read_text())
+        print((study.out / f"{file_stem(name, study.recipe)}.md").read_text())
     return result
 
 

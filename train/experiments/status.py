@@ -16,7 +16,7 @@ from train.experiments.study import Study, after_stage1, parts_of
 # timed.
 _SECONDS_PER_STEP = {
     "ours": 0.3, "deterministic": 0.16, "psgn": 0.15, "psgn-mon": 0.6, "front-mon": 0.31,
-    "lin": 0.07, "r2n2": 0.47, "ptn": 0.17,
+    "lin": 0.07, "r2n2": 0.47, "ptn": 0.17, "whole shapes": 0.62, "whole shapes, deterministic": 0.25,
 }  # fmt: skip
 
 
@@ -105,9 +105,9 @@ def _sum(costs: Iterable[float | None]) -> float | None:
     return None if None in values else float(sum(value or 0.0 for value in values))
 
 
-def _kind(config: FitConfig) -> tuple[str, str, bool, bool]:
+def _kind(config: FitConfig) -> tuple[str, str, str, bool, bool]:
     """Steps of trainings of one kind take the same time."""
-    return config.profile, config.system, config.deterministic, "stage1" in config.phases
+    return config.profile, config.system, config.recipe, config.deterministic, "stage1" in config.phases
 
 
 def _steps(config: FitConfig) -> int:
@@ -129,5 +129,8 @@ def _seconds(config: FitConfig, speeds: Mapping[Any, float]) -> float | None:
     """Processor seconds that a training will take."""
     speed = speeds.get(_kind(config))
     if speed is None and config.profile == "cpu":
-        speed = _SECONDS_PER_STEP["deterministic" if config.deterministic else config.system]
+        kind = "deterministic" if config.deterministic else config.system
+        if config.recipe == "whole-shapes":
+            kind = "whole shapes, deterministic" if config.deterministic else "whole shapes"
+        speed = _SECONDS_PER_STEP[kind]
     return None if speed is None else speed * _steps(config)

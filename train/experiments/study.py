@@ -25,6 +25,7 @@ from train.config import (
     FitConfig,
     InferenceConfig,
     Profile,
+    Recipe,
     changed_settings,
     fit_config_from_json,
     with_steps,
@@ -37,7 +38,8 @@ from train.evaluation.runs import best_weights, load_predictor, read_split
 from train.experiments import store
 from train.experiments.store import Metrics, NotMeasured
 from train.files import write_text
-from train.methods import get_method, recipe
+from train.methods import get_method
+from train.methods import recipe as recipe_of
 from train.processes import run_in_processes
 from train.training import TRAINING_VERSION
 from train.training.trainer import fit
@@ -63,7 +65,7 @@ class Study:
     out: Path
     """Directory for runs, metrics and results."""
     profile: Profile = "cpu"
-    """Size of the networks and recipe of their training."""
+    """Size of the networks, and length of their training."""
     seeds: int = 3
     """Number of trainings of each variant, with seeds 0, 1, ..."""
     limit: int | None = None
@@ -82,6 +84,8 @@ class Study:
     """For agreement and coverage, a trained run as `open_run` takes it; networks are trained here if not given."""
     views: int = 8
     """For agreement, views per shape."""
+    recipe: Recipe = "paper"
+    """How our method is trained; other methods have one recipe each."""
     measures: bool = True
     """False: `NotMeasured` is raised instead of measuring anything."""
     _splits: dict[tuple, LoadedSplit] = dataclasses.field(default_factory=dict, repr=False, compare=False)
@@ -96,7 +100,9 @@ class Study:
 
     def config(self, change: Change, *, seed: int) -> FitConfig:
         """The profile's configuration with the changes of a variant."""
-        config = dataclasses.replace(change(recipe("ours", self.profile)), seed=seed, picture_every=0)
+        config = dataclasses.replace(
+            change(recipe_of("ours", self.profile, self.recipe)), seed=seed, picture_every=0
+        )
         return config if self.steps is None else with_steps(config, self.steps)
 
     def configs(self, *changes: Change) -> list[FitConfig]:
@@ -326,10 +332,16 @@ class Study:
         """What every result states of its making: profile, data, seeds, and the networks' configuration."""
         return {
             "profile": self.profile,
+            "recipe": self.recipe,
             "data": [str(root) for root in self.data],
             "seeds": self.seeds,
             "config": dataclasses.asdict(config),
         }
+
+
+def file_stem(experiment: str, recipe: Recipe) -> str:
+    """Name of the files with an experiment's results; those of another recipe than the paper's begin with its name."""
+    return experiment if recipe == "paper" else f"{recipe}-{experiment}"
 
 
 def unchanged(config: FitConfig) -> FitConfig:
@@ -343,7 +355,7 @@ def of_method(name: Any) -> Change:
 
 
 def _recipe_like(config: FitConfig, name: str) -> FitConfig:
-    return recipe(name, config.profile)
+    return recipe_of(name, config.profile)
 
 
 def after_stage1(config: FitConfig) -> FitConfig:

@@ -13,6 +13,7 @@ from train.config import FitConfig, StageConfig
 from train.data.batches import Batch, LoadedSplit
 from train.evaluation.metrics import visible_error
 from train.evaluation.per_shape import (
+    compare_clouds,
     concatenate,
     distance_to_nearest,
     one_view_each,
@@ -85,6 +86,21 @@ def ten_predictions(row: Row, study: Study, config: FitConfig) -> Metrics:
 
     inputs = [study.weights_key(of_critic), trained_on.fingerprint, _TRAINED_PREDICTIONS, steps]
     return found | measured("critic", inputs, critic)  # apart: the distances need no critic
+
+
+def best_of_ten(row: Row, study: Study, config: FitConfig) -> Metrics:
+    """Errors of that of ten predictions from one image which is nearest to the ground truth by chamfer distance."""
+
+    def measure(model: Predictor, test: LoadedSplit) -> Metrics:
+        parts = []
+        for shapes, _, clouds in sample_predictions(model, test, codes=_PREDICTIONS, seed=config.seed):
+            true = test.points[shapes].expand(len(clouds), -1, -1, -1)
+            found = compare_clouds(clouds, true, points=model.points)
+            best = found["cd"].argmin(0)[None]
+            parts.append({name: values.gather(0, best)[0] for name, values in found.items()})
+        return concatenate(parts)
+
+    return study.measure(config, ["best of predictions", _PREDICTIONS], measure, stage=row.stage)
 
 
 def _samples(

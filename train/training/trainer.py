@@ -304,7 +304,7 @@ class Trainer:
     def _load_weights(self, run_or_file: Path) -> None:
         """Takes the weights of a network that differs at most in having a narrower decoder."""
         found, network = load_predictor(run_or_file), self.state.network
-        sizes = [dataclasses.asdict(of.config) | {"decoder_width": None} for of in (found, network)]
+        sizes = [vars(of.config) | {"decoder_width": None} for of in (found, network)]
         try:
             if type(found) is not type(network) or sizes[0] != sizes[1]:
                 raise ValueError("other networks")
