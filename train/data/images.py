@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,14 @@ from torch.nn import functional as F
 
 from train.errors import UserError
 
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
+UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".nef")
+"""Formats of cameras that have to be converted first."""
+
 _SMALLEST = 16
+_LARGEST = 1 << 30  # pixels; they would take 3 GB
+_ENOUGH = 50_000_000
+"""Pictures with more pixels are read at a reduced size."""
 _WHITE = 0.985
 _BLANK = 0.97
 
@@ -26,13 +35,29 @@ def decode(path: str | Path) -> np.ndarray:
     Raises:
         OSError, ValueError, or another exception of the format's decoder: the file is missing or broken.
     """
-    with Image.open(path) as file:
+    with _open(path) as file:
         image = ImageOps.exif_transpose(file)  # cameras note how they were held instead of turning the pixels
         if image.mode.startswith("I"):  # 16 bits of grey; older versions of Pillow widen them to 32
             return np.asarray(image).clip(0, 65535).astype(np.uint16)[..., None]
-        if image.mode not in ("L", "LA", "RGB", "RGBA", "F"):
+        one_clear_colour = "transparency" in image.info
+        if one_clear_colour or image.mode not in ("L", "LA", "RGB", "RGBA", "F"):
             image = image.convert("RGBA")
+        if image.width * image.height > _ENOUGH:
+            image = image.reduce(math.ceil(math.sqrt(image.width * image.height / _ENOUGH)))
         return np.atleast_3d(np.asarray(image))
+
+
+@contextmanager
+def _open(path: str | Path) -> Iterator[Image.Image]:
+    """Opens a picture without Pillow's limit on its size, and with ours."""
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        with Image.open(path) as file:
+            if file.width * file.height > _LARGEST:
+                raise ValueError(f"{file.width} x {file.height} pixels are too many: make it smaller")
+            yield file
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
 
 
 def on_white(pixels: np.ndarray) -> Tensor:
@@ -104,8 +129,13 @@ def _decode_object(path: str | Path) -> np.ndarray:
         pixels = decode(path)
         if not np.isfinite(pixels).all():
             raise ValueError("some pixels are not finite")
+        if pixels.dtype.kind == "f" and not -0.01 <= pixels.min() <= pixels.max() <= 1.01:
+            found = f"floats from {pixels.min():g} to {pixels.max():g}"
+            raise ValueError(f"its pixels are {found} and should be between 0 and 1: save it with 8 bits")
     except Exception as error:  # every decoder has its own exceptions; all mean that this is no image
         reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+        if Path(path).suffix.lower() in UNREADABLE_SUFFIXES:
+            reason = f"convert {Path(path).suffix} files to JPEG or PNG first"
         raise UserError(f"{path} is not an image that can be read ({reason})") from None
     height, width = pixels.shape[:2]
     if min(height, width) < _SMALLEST:

@@ -16,9 +16,10 @@ import trimesh
 from PIL import Image
 from trimesh.resolvers import FilePathResolver
 from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from diffpoint.camera import PinholeCamera
-from train.data import game_meshes, tree_files
+from train.data import game_meshes, mesh_text, tree_files
 from train.data.categories import category_of
 from train.data.mesh_sources import (
     UPRIGHT,
@@ -99,6 +100,7 @@ class MeshReport:
         made, kept, others: its shapes that this run and an earlier one have made of these sources, and all others.
         counts, categories: its shapes by split and by category.
         failures: reasons by the name of the mesh.
+        missing_files: textures and other files that were not found, by the name of the mesh that names them.
     """
 
     out: Path
@@ -108,6 +110,7 @@ class MeshReport:
     counts: dict[str, int]
     categories: dict[str, int]
     failures: dict[str, str]
+    missing_files: dict[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
     def summary(self) -> str:
         """Lines for the terminal."""
@@ -121,6 +124,11 @@ class MeshReport:
             lines += [f"  {name}: {reason}" for name, reason in named[:_NAMED]]
             if len(named) > _NAMED:
                 lines.append(f"  and {len(named) - _NAMED} others; {self.out / LEFT_OUT} names all")
+        if self.missing_files:
+            lines.append(f"{len(self.missing_files)} meshes were made without files that they name:")
+            named = sorted(self.missing_files.items())
+            lines += [f"  {name}: {', '.join(files)}" for name, files in named[:_NAMED]]
+            lines += [f"  and {len(named) - _NAMED} others"] if len(named) > _NAMED else []
         return "\n".join(lines)
 
 
@@ -209,14 +217,17 @@ def convert(
             for copy in range(1 + options.stretched)
         ]
         made = kept = 0
+        missing_files: dict[str, tuple[str, ...]] = {}
         for job, result in map_unordered(
             _convert_one, jobs, processes=processes, title="rendering meshes", unit="mesh"
         ):
             if isinstance(result, Exception):
                 failures[job.mesh.name] = str(result)
             else:
-                made += result
-                kept += not result
+                made += result is not None
+                kept += result is None
+                if result:
+                    missing_files[job.mesh.name] = result
     counts = tree_files.write_lists(out, seed=seed)
     totals = {split: sum(by_synset.values()) for split, by_synset in counts.items()}
     if not sum(totals.values()):
@@ -233,13 +244,13 @@ def convert(
         for synset in counts["train"]
     }
     others = sum(totals.values()) - made - kept
-    return MeshReport(out, made, kept, others, totals, categories, failures)
+    return MeshReport(out, made, kept, others, totals, categories, failures, missing_files)
 
 
-def _convert_one(job: _Job) -> int | Exception:
-    """Makes one shape if it is not there yet; returns how many were made."""
+def _convert_one(job: _Job) -> tuple[str, ...] | Exception | None:
+    """Makes one shape and returns the names of files that were not found; None if it was there already."""
     if tree_files.is_written(job.out, job.shape):
-        return 0
+        return None
     options = job.options
     try:
         surface = load_surface(job.mesh.path, job.mesh.rotation, scale=options.scale, root=job.mesh.root)
@@ -270,7 +281,7 @@ def _convert_one(job: _Job) -> int | Exception:
         return error
     except Exception as error:  # whatever is wrong with one mesh, the others must be made
         return MeshError(f"{type(error).__name__}: {error}")
-    return 1
+    return surface.missing_files
 
 
 # Reading a mesh file: any format of trimesh or `game_meshes`, with its textures, materials and colours.
@@ -309,6 +320,8 @@ def load_surface(
         with path.open("rb") as file:
             if suffix in game_meshes.READERS:
                 scene = game_meshes.READERS[suffix](file.read(), files.get)
+            elif suffix in mesh_text.READERS:
+                scene = mesh_text.READERS[suffix](file.read(), files)
             else:
                 scene = trimesh.load(file, file_type=suffix[1:], resolver=files, force="scene", process=False)
         parts = _parts(scene)  # pyright: ignore[reportArgumentType]
@@ -338,7 +351,12 @@ def load_surface(
         raise MeshError("flat: all its faces lie in one plane, a view along it would show nothing")
     if scale is not None:
         corners *= diagonal * scale
-    return dataclasses.replace(surface, vertices=corners, faces=np.arange(len(corners)).reshape(-1, 3))
+    return dataclasses.replace(
+        surface,
+        vertices=corners,
+        faces=np.arange(len(corners)).reshape(-1, 3),
+        missing_files=tuple(dict.fromkeys(files.missing)),
+    )
 
 
 def stretch(surface: Surface, rng: np.random.Generator) -> Surface:
@@ -365,18 +383,20 @@ class _Files(FilePathResolver):
     def __init__(self, path: Path, root: Path) -> None:
         super().__init__(str(path))
         self._root = root.resolve()
+        self.missing: list[str] = []
 
     def get(self, name: str) -> bytes:
         name = name.strip().replace("\\", "/")
         for candidate in (name, name.lstrip("/"), name.rpartition("/")[2]):
             path = Path(self.parent, candidate).resolve()
             if path.is_relative_to(self._root) and path.is_file():
-                return path.read_bytes()
+                return mesh_text.clean_mtl(path.read_bytes()) if path.suffix == ".mtl" else path.read_bytes()
         # FlightGear's paints: in this folder is one for each airline.
         paints = Path(self.parent).resolve().parent / "Textures"
         for path in sorted(paints.rglob(glob.escape(name.rpartition("/")[2]))):
             if path.is_relative_to(self._root) and path.is_file():
                 return path.read_bytes()
+        self.missing.append(name)
         raise FileNotFoundError(name)
 
 
@@ -410,7 +430,7 @@ def _coloured(mesh: trimesh.Trimesh, vertices: np.ndarray, faces: np.ndarray) ->
                 np.ones((len(faces), 3, 3), np.float32),
                 np.zeros(len(faces), int),
                 np.asarray(uv, np.float32)[faces],
-                (_texture(image),),
+                (_texture(image, *_transparency(material)),),
             )
         colours[:] = np.asarray(material.main_color[:3]) / 255
     elif isinstance(visual, ColorVisuals) and visual.kind == "vertex":
@@ -422,9 +442,23 @@ def _coloured(mesh: trimesh.Trimesh, vertices: np.ndarray, faces: np.ndarray) ->
     return Surface.plain(vertices, faces, colours)
 
 
-def _texture(image: Image.Image) -> np.ndarray:
+def _transparency(material: object) -> tuple[str, float]:
+    """How a material reads its texture's alpha, and the threshold of MASK; glTF's default is not to read it."""
+    mode = (
+        (getattr(material, "alphaMode", None) or "OPAQUE") if isinstance(material, PBRMaterial) else "BLEND"
+    )
+    cutoff = getattr(material, "alphaCutoff", None)
+    return mode, 0.5 if cutoff is None else cutoff
+
+
+def _texture(image: Image.Image, alpha_mode: str, cutoff: float) -> np.ndarray:
     """RGB (h, w, 3) uint8, transparency on white."""
     image = image.convert("RGBA")
+    if alpha_mode == "OPAQUE":
+        image.putalpha(255)
+    elif alpha_mode == "MASK":
+        shown = np.asarray(image.getchannel("A")) >= 255 * cutoff
+        image.putalpha(Image.fromarray(np.where(shown, 255, 0).astype(np.uint8)))
     image.thumbnail((_TEXTURE_SIZE, _TEXTURE_SIZE))
     ground = Image.new("RGBA", image.size, "white")
     return np.asarray(Image.alpha_composite(ground, image).convert("RGB"))

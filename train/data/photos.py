@@ -24,15 +24,13 @@ from PIL import Image
 
 from train.data import tree_files
 from train.data.cutout import cut_out
-from train.data.images import read_rgba
+from train.data.images import PICTURE_SUFFIXES, UNREADABLE_SUFFIXES, read_rgba
 from train.errors import UserError
 from train.files import replacing, write_text
 from train.processes import map_unordered
 
 MASKS = "masks"
 
-_ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
-_UNREADABLE = (".heic", ".heif", ".avif", ".dng", ".cr2", ".nef")
 _PRODUCTS = "_final"
 _LISTING = re.compile(r"(\d+)_(\d+)")
 _MASK_FOLDERS = (MASKS, "mask")
@@ -133,7 +131,7 @@ def convert_photos(
     if not by_object:
         few = f" of an object with at least {fewest}" if fewest > 1 else ""
         said = "".join(f"; {name}: {reason}" for name, reason in list(failures.items())[:1])
-        raise UserError(f"no photographs{few} in {source}; looked for {', '.join(_ENDINGS)}{said}")
+        raise UserError(f"no photographs{few} in {source}; looked for {', '.join(PICTURE_SUFFIXES)}{said}")
     chosen = [photo for name in list(by_object)[:objects] for photo in by_object[name]]
     tree_files.prepare_output(out, {"kind": "photos", "size": size})
     for leftover in list(out.glob("**/.*.tmp")):
@@ -178,9 +176,9 @@ def find_photos(source: str | Path) -> tuple[dict[str, list[Photo]], dict[str, s
         hidden = any(part.startswith(".") for part in inside.parts)
         if hidden or path.parent.name in _MASK_FOLDERS or path.stem.endswith("_mask") or not path.is_file():
             continue
-        if path.suffix.lower() in _ENDINGS:
+        if path.suffix.lower() in PICTURE_SUFFIXES:
             by_folder[path.parent].append(path)
-        elif path.suffix.lower() in _UNREADABLE:
+        elif path.suffix.lower() in UNREADABLE_SUFFIXES:
             failures[str(inside)] = f"{path.suffix} pictures cannot be read; save it as JPEG or PNG"
     found: dict[str, list[Photo]] = defaultdict(list)
     for paths in by_folder.values():
@@ -204,7 +202,7 @@ def _object_of(path: Path, beside: list[Path], source: Path) -> str:
 
 def _given_mask(path: Path) -> Path | None:
     places = [f"{path.stem}_mask", *(f"{folder}/{path.stem}" for folder in _MASK_FOLDERS)]
-    candidates = (path.parent / f"{place}{ending}" for place in places for ending in _ENDINGS)
+    candidates = (path.parent / f"{place}{ending}" for place in places for ending in PICTURE_SUFFIXES)
     return next((each for each in candidates if each.is_file()), None)
 
 

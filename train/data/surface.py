@@ -18,6 +18,7 @@ class Surface:
         face_texture: (F,) int, index into `textures`, or -1 for faces that have corner colours.
         corner_uv: (F, 3, 2) float32, v up; read where `face_texture` >= 0.
         textures: images (h, w, 3) uint8.
+        missing_files: names of files that the mesh's file names and that were not found.
     """
 
     vertices: np.ndarray
@@ -26,6 +27,7 @@ class Surface:
     face_texture: np.ndarray
     corner_uv: np.ndarray
     textures: tuple[np.ndarray, ...] = ()
+    missing_files: tuple[str, ...] = ()
 
     @staticmethod
     def plain(vertices: np.ndarray, faces: np.ndarray, face_colours: np.ndarray) -> Surface:

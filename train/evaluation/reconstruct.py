@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffpoint.io import write_points
 from train.data.cutout import cut_out
-from train.data.images import is_cut_out, read_images, read_rgba
+from train.data.images import PICTURE_SUFFIXES, is_cut_out, read_images, read_rgba
 from train.data.layouts import pictures_of
 from train.errors import UserError
 from train.evaluation.explore import explore, not_explorable
@@ -21,7 +21,6 @@ from train.files import remove, replacing
 from train.show.explorer import write_explorer
 
 MOST_IMAGES = 24
-_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 
 def reconstruct_to_files(
@@ -126,7 +125,9 @@ def image_files(paths: Sequence[str | Path]) -> list[Path]:
         if not path.is_dir():
             found.append(path)
             continue
-        inside = pictures_of(path) or sorted(p for p in path.iterdir() if p.suffix.lower() in _ENDINGS)
+        inside = pictures_of(path) or sorted(
+            p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES
+        )
         if not inside:
             raise UserError(
                 f"{path} is a folder without pictures; name pictures, or a folder that holds some"
