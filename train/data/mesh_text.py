@@ -88,7 +88,7 @@ def read_off(content: bytes, files: Any) -> trimesh.Scene:
         for second, third in itertools.pairwise(corners[1:]):
             faces.append([corners[0], second, third])
             colours.append(colour)
-    given: dict[str, np.ndarray] = {}
+    given: dict[str, Any] = {}
     if match[1]:
         given["vertex_colors"] = _colours([line[3:] for line in of_vertices])
     elif colours and all(len(colour) >= 3 for colour in colours):
