@@ -216,7 +216,7 @@ class FitConfig:
     as much as photographs need."""
     precision: Precision = "float32"
     """Number format of the generator during training. bfloat16: all layers but the last, about twice as fast where the
-    processor can multiply such numbers (avx512_bf16, amx; see lscpu), slower elsewhere."""
+    processor can multiply such numbers (avx512_bf16, amx; see lscpu), slower elsewhere, and slower with group norms."""
     autoencoder: str | None = None
     """A run, or a .safetensors file of one, whose auto-encoder is used instead of training one."""
     start: str | None = None

@@ -152,7 +152,7 @@ def _measure(
         for n in counts:
             bar.set_description(f"{n} view{'s' if n > 1 else ''}")
             for settings, table in zip(ways, tables, strict=True):
-                if n == 1 and 1 in tables[0]:
+                if n == 1 and 1 in tables[0] and not config.inference.medoid:
                     table[1] = tables[0][1]  # with one view there is no search
                     continue
                 step = work[n] if settings is config.inference else 0
