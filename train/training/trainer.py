@@ -310,9 +310,17 @@ class Trainer:
                 raise ValueError("other networks")
             widen(network, found)
         except ValueError:
+            theirs, ours = (vars(of.config) for of in (found, network))
+            apart = [
+                f"{name} {theirs.get(name)} there, {ours[name]} here"
+                for name in ours
+                if theirs.get(name) != ours[name]
+            ]
             raise UserError(
-                f"{run_or_file} holds the weights of another network than the one to be trained (--system, --profile, "
-                "--output-head, --deterministic); start from one of the same kind, whose decoder may be narrower"
+                f"{run_or_file} holds the weights of another network than the one to be trained ("
+                f"{'; '.join(apart) or 'another --system'}); start from one of the same kind, whose decoder may be "
+                "narrower, or set --system, --profile, --decoder-width, --points-per-cell, --group-norm, --output-head and "
+                "--deterministic as there"
             ) from None
 
     def _load_autoencoder(self, run: Path) -> None:
