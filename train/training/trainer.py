@@ -319,8 +319,8 @@ class Trainer:
             raise UserError(
                 f"{run_or_file} holds the weights of another network than the one to be trained ("
                 f"{'; '.join(apart) or 'another --system'}); start from one of the same kind, whose decoder may be "
-                "narrower, or set --system, --profile, --decoder-width, --points-per-cell, --group-norm, --output-head and "
-                "--deterministic as there"
+                "narrower, or set --system, --profile, --decoder-width, --points-per-cell, --group-norm, "
+                "--output-head and --deterministic as there"
             ) from None
 
     def _load_autoencoder(self, run: Path) -> None:
