@@ -98,6 +98,8 @@ def test_a_name_of_no_method_is_refused_with_the_names_of_all() -> None:
             {"stage1": dataclasses.replace(recipe("ours", "smoke").stage1, codes=1)},
             "got --stage1.codes 1",
         ),
+        ("ours", {"decoder_width": 0}, "--decoder-width must be at least 1; got 0"),
+        ("ours", {"points_per_cell": 0}, "--points-per-cell must be at least 1; got 0"),
         ("psgn", {"output_head": "latent"}, "does not support"),
         ("psgn", {"deterministic": True}, "does not support"),
         ("psgn", {"variant": "highly-diverse"}, "does not support"),

@@ -124,7 +124,7 @@ def _load(content: bytes, kind: str, files: Any) -> trimesh.Scene:
 
 
 def _as_utf8(content: bytes) -> bytes:
-    return content.decode("utf-8", errors="replace").encode()
+    return content if content.isascii() else content.decode("utf-8", errors="replace").encode()
 
 
 READERS: dict[str, Callable[[bytes, Any], trimesh.Scene]] = {

@@ -118,17 +118,15 @@ class MeshReport:
         earlier = f", {self.kept} were there" if self.kept else ""
         earlier += f", {self.others} are not from these sources" if self.others else ""
         lines = [f"{self.out}: made {self.made} shapes{earlier} ({splits}): {kinds}"]
-        if self.failures:
-            lines.append(f"{len(self.failures)} meshes were left out:")
-            named = sorted(self.failures.items())
+        lost = {name: ", ".join(files) for name, files in self.missing_files.items()}
+        for words, by_mesh, rest in (
+            ("meshes were left out:", self.failures, f"; {self.out / LEFT_OUT} names all"),
+            ("meshes were made without files that they name:", lost, ""),
+        ):
+            named = sorted(by_mesh.items())
+            lines += [f"{len(named)} {words}"] if named else []
             lines += [f"  {name}: {reason}" for name, reason in named[:_NAMED]]
-            if len(named) > _NAMED:
-                lines.append(f"  and {len(named) - _NAMED} others; {self.out / LEFT_OUT} names all")
-        if self.missing_files:
-            lines.append(f"{len(self.missing_files)} meshes were made without files that they name:")
-            named = sorted(self.missing_files.items())
-            lines += [f"  {name}: {', '.join(files)}" for name, files in named[:_NAMED]]
-            lines += [f"  and {len(named) - _NAMED} others"] if len(named) > _NAMED else []
+            lines += [f"  and {len(named) - _NAMED} others{rest}"] if len(named) > _NAMED else []
         return "\n".join(lines)
 
 
@@ -355,7 +353,7 @@ def load_surface(
         surface,
         vertices=corners,
         faces=np.arange(len(corners)).reshape(-1, 3),
-        missing_files=tuple(dict.fromkeys(files.missing)),
+        missing_files=files.missing,
     )
 
 
@@ -383,21 +381,35 @@ class _Files(FilePathResolver):
     def __init__(self, path: Path, root: Path) -> None:
         super().__init__(str(path))
         self._root = root.resolve()
-        self.missing: list[str] = []
+        self._asked: dict[str, bool] = {}
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Names that were not found, under no suffix that was tried."""
+        found = {Path(name).stem for name, exists in self._asked.items() if exists}
+        return tuple(
+            name for name, exists in self._asked.items() if not exists and Path(name).stem not in found
+        )
 
     def get(self, name: str) -> bytes:
         name = name.strip().replace("\\", "/")
+        content = self._read(name)
+        self._asked[name] = content is not None
+        if content is None:
+            raise FileNotFoundError(name)
+        return mesh_text.clean_mtl(content) if name.lower().endswith(".mtl") else content
+
+    def _read(self, name: str) -> bytes | None:
         for candidate in (name, name.lstrip("/"), name.rpartition("/")[2]):
             path = Path(self.parent, candidate).resolve()
             if path.is_relative_to(self._root) and path.is_file():
-                return mesh_text.clean_mtl(path.read_bytes()) if path.suffix == ".mtl" else path.read_bytes()
+                return path.read_bytes()
         # FlightGear's paints: in this folder is one for each airline.
         paints = Path(self.parent).resolve().parent / "Textures"
         for path in sorted(paints.rglob(glob.escape(name.rpartition("/")[2]))):
             if path.is_relative_to(self._root) and path.is_file():
                 return path.read_bytes()
-        self.missing.append(name)
-        raise FileNotFoundError(name)
+        return None
 
 
 def _parts(scene: trimesh.Scene) -> list[Surface]:

@@ -124,16 +124,20 @@ def _reconstruct(
 ) -> Reconstruction:
     """(B, V, 3, H, W) images and (G, B, V, D) candidate codes, all in memory at once."""
     shapes, views = images.shape[:2]
-    if views == 1 or not model.takes_codes:
-        codes = candidates[0]
-        if settings.medoid and settings.groups > 1 and model.takes_codes:
-            codes = candidates[_medoid(model, images[:, 0], candidates[:, :, 0]), torch.arange(shapes)]
-        points = model.predict_views(images, codes).flatten(1, 2)
-        no_history = torch.zeros(0, shapes)
-        return Reconstruction(points, codes, no_history, torch.zeros(shapes, dtype=torch.int64))
+    no_descent = torch.zeros(0, shapes), torch.zeros(shapes, dtype=torch.int64)
+    chooses = model.takes_codes and (views > 1 or (settings.medoid and settings.groups > 1))
+    if not chooses:
+        points = model.predict_views(images, candidates[0]).flatten(1, 2)
+        return Reconstruction(points, candidates[0], *no_descent)
     with torch.no_grad():
         features = model.encode(images.flatten(0, 1)).unflatten(0, (shapes, views))
         codes = candidates[0]
+        if views == 1:
+            clouds = torch.cat(
+                [_decode(model, features, group) for group in candidates], dim=1
+            )  # (B, G, N, 3)
+            chosen = _medoid(clouds), torch.arange(shapes)
+            return Reconstruction(clouds.transpose(0, 1)[chosen], candidates[chosen], *no_descent)
         if settings.groups > 1:
             scores = [
                 consistency_loss(_decode(model, features, group), reduction="none") for group in candidates
@@ -142,13 +146,13 @@ def _reconstruct(
     return _descend(model, features, codes, settings)
 
 
-@torch.no_grad()
-def _medoid(model: Predictor, images: Tensor, codes: Tensor) -> Tensor:
-    """(B, 3, H, W) images, (G, B, D) codes -> (B,) the code whose prediction is nearest to all the others."""
-    clouds = model(images, codes)
-    distances = torch.zeros(len(codes), *clouds.shape[:2])
-    for other in range(1, len(codes)):
-        pair = chamfer_distance(clouds[:other], clouds[other].expand(other, -1, -1, -1), squared=False)
+def _medoid(clouds: Tensor) -> Tensor:
+    """(B, G, N, 3) -> (B,) which of the G clouds of each shape has the least mean chamfer distance to the others."""
+    by_number = clouds.transpose(0, 1).contiguous()
+    distances = torch.zeros(len(by_number), *by_number.shape[:2])
+    for other in range(1, len(by_number)):
+        among = by_number[:other]
+        pair = chamfer_distance(among, by_number[other].expand_as(among), squared=False)
         distances[:other, other] = distances[other, :other] = pair.a_to_b + pair.b_to_a
     return distances.sum(1).argmin(0)
 

@@ -16,7 +16,7 @@ from train.experiments.study import Study, after_stage1, parts_of
 # timed.
 _SECONDS_PER_STEP = {
     "ours": 0.3, "deterministic": 0.16, "psgn": 0.15, "psgn-mon": 0.6, "front-mon": 0.31,
-    "lin": 0.07, "r2n2": 0.47, "ptn": 0.17, "whole shapes": 0.62, "whole shapes, deterministic": 0.25,
+    "lin": 0.07, "r2n2": 0.47, "ptn": 0.17, "ours, whole shapes": 0.43, "deterministic, whole shapes": 0.28,
 }  # fmt: skip
 
 
@@ -130,7 +130,6 @@ def _seconds(config: FitConfig, speeds: Mapping[Any, float]) -> float | None:
     speed = speeds.get(_kind(config))
     if speed is None and config.profile == "cpu":
         kind = "deterministic" if config.deterministic else config.system
-        if config.recipe == "whole-shapes":
-            kind = "whole shapes, deterministic" if config.deterministic else "whole shapes"
+        kind += ", whole shapes" if config.recipe == "whole-shapes" else ""
         speed = _SECONDS_PER_STEP[kind]
     return None if speed is None else speed * _steps(config)

@@ -195,6 +195,9 @@ class Ours(Method):
         return generator
 
     def check(self, config: FitConfig) -> None:
+        for name in ("decoder_width", "points_per_cell"):
+            if getattr(config, name) < 1:
+                raise UserError(f"--{name.replace('_', '-')} must be at least 1; got {getattr(config, name)}")
         if config.occupancy_logits and config.output_head == "latent":
             raise UserError("supervision lin needs points that may be deleted; leave --output-head at points")
         for name, stage in zip(("stage1", "stage2"), config.stages, strict=True):

@@ -304,21 +304,17 @@ class Trainer:
     def _load_weights(self, run_or_file: Path) -> None:
         """Takes the weights of a network that differs at most in having a narrower decoder."""
         found, network = load_predictor(run_or_file), self.state.network
-        sizes = [vars(of.config) | {"decoder_width": None} for of in (found, network)]
+        theirs, ours = vars(found.config), vars(network.config)
+        apart = [name for name in ours if theirs.get(name) != ours[name]]
         try:
-            if type(found) is not type(network) or sizes[0] != sizes[1]:
+            if type(found) is not type(network) or set(apart) - {"decoder_width"}:
                 raise ValueError("other networks")
             widen(network, found)
         except ValueError:
-            theirs, ours = (vars(of.config) for of in (found, network))
-            apart = [
-                f"{name} {theirs.get(name)} there, {ours[name]} here"
-                for name in ours
-                if theirs.get(name) != ours[name]
-            ]
+            described = "; ".join(f"{name} {theirs.get(name)} there, {ours[name]} here" for name in apart)
             raise UserError(
                 f"{run_or_file} holds the weights of another network than the one to be trained ("
-                f"{'; '.join(apart) or 'another --system'}); start from one of the same kind, whose decoder may be "
+                f"{described or 'another --system'}); start from one of the same kind, whose decoder may be "
                 "narrower, or set --system, --profile, --decoder-width, --points-per-cell, --group-norm, "
                 "--output-head and --deterministic as there"
             ) from None
