@@ -1,8 +1,10 @@
-"""Calls from torch into the Taichi kernels, and the registration of ops with torch. Nothing else does either."""
+"""Calls from torch into the kernels, and the registration of ops with torch. Nothing else does either."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -55,15 +57,16 @@ def register(
     """Decorator: register a function of tensors as the torch operator `diffpoint::<name>`.
 
     `fake` gives the outputs' shapes without computing, `backward` and `setup` are the autograd formula. Differentiating
-    an op without a formula raises an error with its name. The function receives contiguous CPU tensors: arguments on
-    other devices or with other strides are copied first, and the results are moved to the device of the arguments.
-    With `strided` it also receives tensors that are not contiguous, for instance one number expanded.
+    an op without a formula raises an error with its name. The function receives contiguous CPU tensors: arguments with
+    other strides are copied first. With `strided` it also receives tensors that are not contiguous, for instance one
+    number expanded. CUDA tensors go to the kernel of the same name in `diffpoint.cuda`; if there is none, and from all
+    other devices, they are copied to the CPU, and the results back.
     """
 
     def decorate(function: Callable) -> Callable[..., Any]:
         schema = torch.library.infer_schema(function, mutates_args=())
         op = torch.library.custom_op(
-            f"diffpoint::{name}", _on_cpu_tensors(function, strided), mutates_args=(), schema=schema
+            f"diffpoint::{name}", _on_any_device(name, function, strided), mutates_args=(), schema=schema
         )
         op.register_fake(fake)
         if backward is not None:
@@ -73,21 +76,56 @@ def register(
     return decorate
 
 
-def _on_cpu_tensors(function: Callable, strided: bool) -> Callable:
+def _on_any_device(name: str, function: Callable, strided: bool) -> Callable:
     @functools.wraps(function)
     def run(*arguments: Any) -> Any:
-        elsewhere = [a.device for a in arguments if isinstance(a, Tensor) and not a.is_cpu]
-        here = [a.cpu() if isinstance(a, Tensor) else a for a in arguments]
         if not strided:
-            here = [a.contiguous() if isinstance(a, Tensor) else a for a in here]
-        results = function(*here)
+            arguments = tuple(a.contiguous() if isinstance(a, Tensor) else a for a in arguments)
+        elsewhere = [a.device for a in arguments if isinstance(a, Tensor) and not a.is_cpu]
+        if interpreted or (elsewhere and elsewhere[0].type == "cuda"):
+            kernel = _cuda_kernel(name)
+            if kernel is not None:
+                with _device(elsewhere):
+                    return kernel(*arguments)
         if not elsewhere:
-            return results
+            return function(*arguments)
+        results = function(*(a.cpu() if isinstance(a, Tensor) else a for a in arguments))
         if isinstance(results, Tensor):
             return results.to(elsewhere[0])
         return tuple(r.to(elsewhere[0]) for r in results)
 
     return run
+
+
+interpreted = False
+"""Send CPU tensors to the kernels for CUDA, which Triton's interpreter runs; see `testing.cuda_kernels_interpreted`."""
+
+
+@functools.cache
+def _cuda_kernel(name: str) -> Callable | None:
+    from diffpoint import cuda  # not before a CUDA tensor is met
+
+    try:
+        return cuda.kernel_of(name)
+    except ImportError as error:
+        _warn_without_triton(str(error))
+        return None
+
+
+@functools.cache  # once in a process
+def _warn_without_triton(reason: str) -> None:
+    warnings.warn(
+        f"diffpoint: CUDA tensors are copied to the CPU and back, because triton is missing ({reason}). torch's CUDA "
+        "builds for Linux bring it; elsewhere: pip install triton, or triton-windows.",
+        stacklevel=2,
+    )
+
+
+def _device(devices: list[torch.device]) -> contextlib.AbstractContextManager:
+    """Makes the tensors' GPU the current one, on which Triton launches."""
+    if not devices or devices[0].index in (None, torch.cuda.current_device()):
+        return contextlib.nullcontext()
+    return torch.cuda.device(devices[0])
 
 
 def or_zeros(gradient: Tensor | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:

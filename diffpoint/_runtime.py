@@ -14,10 +14,12 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal, get_args
 
 from diffpoint._backend import BACKENDS, backend_name, import_backend
 from diffpoint._launch import FastCall
+
+Checks = Literal["deferred", "immediate", "off"]
 
 # Taichi runs a parallel loop of up to 512 iterations on one thread unless it was started with other settings.
 # Where the host program started Taichi, every loop therefore has this many times the iterations, of which one in so
@@ -48,6 +50,7 @@ class _Runtime:
         self.lock = threading.RLock()
         self.threads: int | None = None
         self.cache = True
+        self.checks: Checks = "deferred"
         self.program: Any = None
         self.forked = False
         self.kernels: dict[tuple[str, str], SimpleNamespace] = {}
@@ -134,16 +137,21 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_mark_forked)
 
 
-def configure(*, threads: int | None = None, cache: bool = True) -> None:
-    """Set how the kernels run; call it before the first op.
+def configure(*, threads: int | None = None, cache: bool | None = None, checks: Checks | None = None) -> None:
+    """Set how the kernels run; call it before the first op. Only `checks` may be changed later.
 
     Args:
-        threads: number of threads of the kernels; None means every core that this process may use.
-        cache: cache compiled kernels on disk, so that the next process starts in a fraction of a second.
+        threads: number of threads of the CPU kernels; None means every core that this process may use.
+        cache: cache compiled CPU kernels on disk, so that the next process starts in a fraction of a second; None means
+            yes.
+        checks: when values of CUDA tensors that are not allowed (NaN, a length out of range) become errors. "deferred",
+            the default, does not wait for the GPU: a later op raises the error, or `check_pending()`. "immediate" waits
+            for every op and names the place of the value. "off" leaves them unnoticed. On the CPU every op raises its
+            own errors at once. None changes nothing.
 
     Raises:
-        RuntimeError: an op has run already (Taichi cannot be started twice in a process).
-        ValueError: fewer than one thread.
+        RuntimeError: threads or cache after an op has run already (Taichi cannot be started twice in a process).
+        ValueError: fewer than one thread, or unknown checks.
 
     Example:
         >>> import subprocess, sys
@@ -153,13 +161,21 @@ def configure(*, threads: int | None = None, cache: bool = True) -> None:
     """
     if threads is not None and (not isinstance(threads, int) or isinstance(threads, bool) or threads < 1):
         raise ValueError(f"configure: 'threads' must be a positive integer or None; got {threads!r}.")
+    if checks is not None and checks not in get_args(Checks):
+        raise ValueError(
+            f"configure: 'checks' must be 'deferred', 'immediate', 'off' or None; got {checks!r}."
+        )
     with RUNTIME.lock:
+        if checks is not None:
+            RUNTIME.checks = checks
+            if threads is None and cache is None:
+                return
         if RUNTIME.program is not None:
             raise RuntimeError(
                 "configure: the kernels have started already; call configure() before the first op."
             )
         RUNTIME.threads = threads
-        RUNTIME.cache = cache
+        RUNTIME.cache = cache is not False
 
 
 def runtime_info() -> RuntimeInfo:

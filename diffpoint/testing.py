@@ -7,11 +7,14 @@ differently, is only meaningful where no point lies on a step: `tie_free_clouds`
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import os
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
 
+from diffpoint import _bridge
 from diffpoint.camera import PinholeCamera, check_views
 
 # Per dtype, relative to the size of the values; large enough for sums of a few thousand terms.
@@ -113,3 +116,31 @@ def assert_close(actual: Tensor, expected: Tensor, *, scale: float = 1.0) -> Non
     """
     tolerance = TOLERANCE.get(expected.dtype, 0.0) * scale
     torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
+
+
+@contextlib.contextmanager
+def cuda_kernels_interpreted() -> Iterator[None]:
+    """Inside, ops on CPU tensors run the kernels for CUDA tensors in Triton's interpreter: slow, for tests without GPU.
+
+    The environment must hold TRITON_INTERPRET=1 before triton is imported for the first time.
+
+    Raises:
+        RuntimeError: it does not.
+        ImportError: triton is missing.
+
+    Example:
+        >>> with cuda_kernels_interpreted():  # doctest: +SKIP
+        ...     check_gradients(lambda a: nearest(a, b).squared_distance, a)
+    """
+    if os.environ.get("TRITON_INTERPRET") != "1":
+        raise RuntimeError(
+            "cuda_kernels_interpreted: set the environment variable TRITON_INTERPRET=1 before triton is imported."
+        )
+    import triton  # noqa: F401
+
+    before = _bridge.interpreted
+    _bridge.interpreted = True
+    try:
+        yield
+    finally:
+        _bridge.interpreted = before

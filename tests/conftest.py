@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads would slow the kernels
+if not Path(
+    "/dev/nvidia0"
+).exists():  # before triton: tests/test_cuda_kernels.py runs its kernels in the interpreter
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
