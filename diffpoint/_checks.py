@@ -119,6 +119,20 @@ def check_sets(
         check_finite(function, name, cloud, lengths)
 
 
+def check_depth(function: str, name: str, depth: Tensor) -> None:
+    """Depth maps hold positive numbers, and +inf where they are empty."""
+    good = depth > 0
+    if not bool(good.all()):
+        where = tuple((~good).nonzero()[0].tolist())
+        raise fail(
+            function,
+            name,
+            "be positive, and +inf where empty",
+            f"{float(depth[where])} at index {where}",
+            "If 0 marks empty pixels: depth.masked_fill(depth == 0, float('inf')).",
+        )
+
+
 def check_clouds(function: str, name: str, value: Any) -> Tensor:
     """A batch of clouds (B, N, 3)."""
     return check_tensor(function, name, value, ("B", "N", 3))

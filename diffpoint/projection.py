@@ -15,7 +15,6 @@ from diffpoint import _checks
 from diffpoint.camera import PinholeCamera, check_views
 from diffpoint.distances import nearest
 from diffpoint.losses import Reduction, check_maps, reduce_loss
-from diffpoint.reproject import check_depth
 from diffpoint.soft_splat import soft_splat
 from diffpoint.splat import splat_depth
 
@@ -249,7 +248,7 @@ def _check(
     if not 0 <= mask_weight < float("inf"):
         raise _checks.fail(function, "mask_weight", "be a finite number of at least 0", repr(mask_weight))
     if not torch.compiler.is_compiling():
-        check_depth(function, "depth", depth.detach())
+        _checks.check_depth(function, "depth", depth.detach())
 
 
 def _check_logits(logits: Tensor, points: Tensor) -> None:

@@ -205,7 +205,7 @@ def _unproject_gradient(ctx, grad_points: Tensor | None, _grad_lengths):
 @_bridge.register("unproject", fake=_unproject_fake, backward=_unproject_gradient, setup=_unproject_setup)
 def _unproject(depth: Tensor, back_projection: Tensor) -> tuple[Tensor, Tensor]:
     batch, views, height, width = depth.shape
-    check_depth("unproject", "depth", depth)
+    _checks.check_depth("unproject", "depth", depth)
     points = depth.new_zeros((batch * views, height * width, 3))
     lengths = torch.zeros(batch * views, dtype=torch.int64)
     if depth.numel():
@@ -283,7 +283,7 @@ def _reproject(
         sizes = rows, columns, height, width
         _bridge.launch("reproject", "reproject", depth.dtype, *inputs, *outputs, *sizes)
         if not math.isfinite(float(total.sum())):
-            check_depth("reproject", "depth", depth)
+            _checks.check_depth("reproject", "depth", depth)
             _checks.check_finite("reproject", "points", points)
     return points, pixels, seen, valid.view(torch.bool)
 
@@ -314,17 +314,3 @@ def _reproject_backward(
         sizes = *steps, *depth.shape[2:]
         _bridge.launch("reproject", "reproject_backward", depth.dtype, *flat, *gradients, *outputs, *sizes)
     return grad_depth, grad_back_projection, grad_projection
-
-
-def check_depth(function: str, name: str, depth: Tensor) -> None:
-    """Depth maps hold positive numbers, and +inf where they are empty."""
-    good = depth > 0
-    if not bool(good.all()):
-        where = tuple((~good).nonzero()[0].tolist())
-        raise _checks.fail(
-            function,
-            name,
-            "be positive, and +inf where empty",
-            f"{float(depth[where])} at index {where}",
-            "If 0 marks empty pixels: depth.masked_fill(depth == 0, float('inf')).",
-        )

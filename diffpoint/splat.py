@@ -76,7 +76,7 @@ def _splat_fake(points: Tensor, lengths: Tensor, projection: Tensor, height: int
 
 
 def _splat_setup(ctx, inputs, output) -> None:
-    points, _, projection, *_ = inputs
+    points, _, projection, *_, ctx.radius = inputs
     _, index, visible = output
     ctx.mark_non_differentiable(index, visible)
     ctx.set_materialize_grads(False)
@@ -87,7 +87,7 @@ def _splat_gradient(ctx, grad_depth: Tensor | None, _grad_index, _grad_visible):
     if grad_depth is None:
         return (None,) * 6
     points, projection, index = ctx.saved_tensors
-    grad_points, grad_projection = _splat_backward(points, projection, index, grad_depth)
+    grad_points, grad_projection = _splat_backward(points, projection, index, grad_depth, ctx.radius)
     return grad_points, None, grad_projection, None, None, None
 
 
@@ -134,14 +134,15 @@ def _parts(rows: int, count: int) -> int:
 
 @_bridge.register(
     "splat_backward",
-    fake=lambda points, projection, index, grad_depth: (
+    fake=lambda points, projection, index, grad_depth, radius: (
         points.new_empty(points.shape),
         projection.new_empty(projection.shape),
     ),
 )
 def _splat_backward(
-    points: Tensor, projection: Tensor, index: Tensor, grad_depth: Tensor
+    points: Tensor, projection: Tensor, index: Tensor, grad_depth: Tensor, radius: float
 ) -> tuple[Tensor, Tensor]:
+    """`radius` tells the kernel for CUDA where a point's pixels lie."""
     _, views, height, width = index.shape
     if points.numel() == 0 or index.numel() == 0:
         return points.new_zeros(points.shape), projection.new_zeros(projection.shape)

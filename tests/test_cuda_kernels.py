@@ -61,6 +61,13 @@ def on_cpu(function, *arguments):
         _bridge.interpreted = before
 
 
+def assert_same(function, *arguments) -> None:
+    """The kernels for CUDA give what those for the CPU give; sums up to rounding of their largest terms."""
+    for here, there in zip(function(*arguments), on_cpu(function, *arguments), strict=True):
+        finite = there[torch.isfinite(there)].abs()
+        assert_close(here, there, scale=max(1.0, float(finite.max())) if finite.numel() else 1.0)
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_nearest(dtype):
     a, b = torch.rand(3, 150, 3, dtype=dtype), torch.rand(3, 70, 3, dtype=dtype)
@@ -72,8 +79,66 @@ def test_nearest(dtype):
         finite = torch.where(torch.isfinite(found.squared_distance), found.squared_distance, 0.0)
         return [*found, *torch.autograd.grad(finite.sum(), (a, b))]
 
-    for here, there in zip(outputs(a, b, *lengths), on_cpu(outputs, a, b, *lengths), strict=True):
-        assert_close(here, there)
+    assert_same(outputs, a, b, *lengths)
+
+
+CAMERA = dp.PinholeCamera.look_at(
+    torch.tensor([[0.0, 0, -2], [2, 0.3, 0]]), focal_px=30.0, height=16, width=14
+)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("radius", [0.0, 0.3, 1.0, 2.6])
+def test_splat(dtype, radius):
+    points = torch.rand(2, 200, 3, dtype=dtype, generator=torch.Generator().manual_seed(1)) * 1.4 - 0.7
+    points[0, 7] = points[0, 3]  # of equal depths the lower index wins
+    points[1, 150:] = torch.nan
+    lengths = torch.tensor([200, 150])
+
+    def outputs(points, lengths):
+        points = points.clone().requires_grad_()
+        camera = CAMERA.to(dtype)
+        matrices = camera.cam_from_world.clone().requires_grad_()
+        camera = dp.PinholeCamera(camera.K, matrices, 16, 14)
+        maps = dp.splat_depth(points, camera, radius=radius, lengths=lengths)
+        weights = torch.linspace(0, 1, maps.depth.numel(), dtype=dtype).view_as(maps.depth)
+        total = (torch.where(maps.index >= 0, maps.depth, 0.0) * weights).sum()
+        return [*maps, *torch.autograd.grad(total, (points, matrices))]
+
+    assert_same(outputs, points, lengths)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_sample_view(dtype):
+    points = torch.rand(2, 300, 3, dtype=dtype) - 0.5
+    visible = torch.rand(2, 3, 300) < 0.3
+    visible[1, 2] = False
+
+    def outputs(points, visible):
+        points = points.clone().requires_grad_()
+        sample = dp.sample_view(points, visible)
+        weights = torch.linspace(0, 1, sample.points.numel(), dtype=dtype).view_as(sample.points)
+        return [*sample, *torch.autograd.grad((sample.points * weights).sum(), points)]
+
+    assert_same(outputs, points, visible)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_projections(dtype):
+    points = torch.rand(2, 300, 3, dtype=dtype) * 5 - 2.5  # some behind the cameras
+    depth = dp.splat_depth(points, CAMERA.to(dtype), radius=1.0).depth
+
+    def outputs(points, depth):
+        inputs = [points, depth, CAMERA.to(dtype).cam_from_world, CAMERA.to(dtype).K]
+        points, depth, matrices, K = inputs = [x.clone().requires_grad_() for x in inputs]
+        camera = dp.PinholeCamera(K, matrices, 16, 14)
+        found = [*dp.project(points, camera), *dp.unproject(depth, camera)]
+        found += dp.reproject(depth, camera, camera[[1, 0]])
+        values = [torch.where(torch.isfinite(x), x, 0.0) for x in found if x.is_floating_point()]
+        total = sum((x * torch.linspace(-1, 1, x.numel(), dtype=dtype).view_as(x)).sum() for x in values)
+        return [*found, *torch.autograd.grad(total, inputs)]
+
+    assert_same(outputs, points, depth)
 
 
 # The last test: it compiles what the others have launched.

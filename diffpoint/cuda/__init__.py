@@ -12,6 +12,11 @@ from collections.abc import Callable
 
 _MODULES = {
     "nearest": ("nearest", "nearest_backward", "nearest_both", "nearest_both_backward"),
+    "splat": ("splat", "splat_backward"),
+    "views": ("sample_view", "sample_view_backward"),
+    "reproject": (
+        "project", "project_backward", "unproject", "unproject_backward", "reproject", "reproject_backward",
+    ),  # fmt: skip
 }
 _MODULE_OF = {operator: module for module, operators in _MODULES.items() for operator in operators}
 
