@@ -133,6 +133,20 @@ def check_depth(function: str, name: str, depth: Tensor) -> None:
         )
 
 
+def check_picks(lengths: Tensor, size: int, k: int, start: int) -> None:
+    """Lengths in range, and no cloud smaller than what `farthest_point_sample` is asked for."""
+    smallest = int(lengths.min()) if len(lengths) else size
+    check_lengths_range("farthest_point_sample", "lengths", lengths, size)
+    for name, value, limit in (("k", k, smallest), ("start", start, max(smallest - 1, 0))):
+        if value > limit and len(lengths):
+            raise fail(
+                "farthest_point_sample",
+                name,
+                f"be at most {limit} (the smallest cloud has {smallest} points)",
+                str(value),
+            )
+
+
 def check_clouds(function: str, name: str, value: Any) -> Tensor:
     """A batch of clouds (B, N, 3)."""
     return check_tensor(function, name, value, ("B", "N", 3))

@@ -55,16 +55,7 @@ def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Te
 )
 def _farthest(points: Tensor, lengths: Tensor, k: int, start: int) -> Tensor:
     batch, size, _ = points.shape
-    smallest = int(lengths.min()) if batch else size
-    _checks.check_lengths_range("farthest_point_sample", "lengths", lengths, size)
-    for name, value, limit in (("k", k, smallest), ("start", start, max(smallest - 1, 0))):
-        if value > limit and batch:
-            raise _checks.fail(
-                "farthest_point_sample",
-                name,
-                f"be at most {limit} (the smallest cloud has {smallest} points)",
-                str(value),
-            )
+    _checks.check_picks(lengths, size, k, start)
     _checks.check_finite("farthest_point_sample", "points", points, lengths)
     chosen = torch.empty((batch, k), dtype=torch.int64)
     if chosen.numel() == 0:

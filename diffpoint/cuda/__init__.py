@@ -13,6 +13,8 @@ from collections.abc import Callable
 _MODULES = {
     "nearest": ("nearest", "nearest_backward", "nearest_both", "nearest_both_backward"),
     "splat": ("splat", "splat_backward"),
+    "sampling": ("farthest_point_sample",),
+    "soft_splat": ("soft_splat", "soft_splat_backward"),
     "views": ("sample_view", "sample_view_backward"),
     "reproject": (
         "project", "project_backward", "unproject", "unproject_backward", "reproject", "reproject_backward",
