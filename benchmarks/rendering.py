@@ -14,8 +14,8 @@ from benchmarks.harness import Contender, Race, Way, both_directions
 from benchmarks.inputs import circle_of_cameras, depth_maps, surfaces
 from benchmarks.peers import each, optional
 from diffpoint import PinholeCamera, reference
-from diffpoint._horizon import FILTERS
-from diffpoint.visibility import _DEFAULTS, METHODS, Method, _limit
+from diffpoint._horizon import FILTERS, limit_of
+from diffpoint.visibility import _DEFAULTS, METHODS, Method
 
 _BORDER = 0.01
 """Share of the pixels that may differ between renderers: rounding moves points on a border into either pixel."""
@@ -150,7 +150,7 @@ def _visible(count: int, n: int, size: int, method: Method) -> Race:
         radius, tolerance = _DEFAULTS[method]
         one = points[:1], camera.K[:1], camera.cam_from_world[:1], (size, size)
         in_torch = lambda: reference.visible_points(  # noqa: E731
-            *one, filters=torch.tensor(FILTERS), radius=radius, limit=_limit(tolerance)
+            *one, filters=torch.tensor(FILTERS), radius=radius, limit=limit_of(tolerance)
         )
         peers.append(Contender("torch", in_torch, lambda visible: visible.float(), units=1))
     ours = lambda: dp.visible_points(points, camera, method=method)  # noqa: E731

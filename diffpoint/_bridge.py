@@ -86,7 +86,9 @@ def _on_any_device(name: str, function: Callable, strided: bool) -> Callable:
             kernel = _cuda_kernel(name)
             if kernel is not None:
                 with _device(elsewhere):
-                    return kernel(*arguments)
+                    results = kernel(*arguments)
+                if results is not NotImplemented:
+                    return results
         if not elsewhere:
             return function(*arguments)
         results = function(*(a.cpu() if isinstance(a, Tensor) else a for a in arguments))

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
+CELL, DEEP = 2.5, 1.5
+"""Cells have this side, in spacings of the points; a point is enclosed if on two of the four lines through its cell the
+cells on both sides are this much nearer."""
 REACH = 4.5
 """Radius of the horizons that the filters read, in spacings of the points."""
 BIAS = -2.905
@@ -17,3 +22,9 @@ FILTERS: tuple[tuple[float, ...], ...] = (
     (-0.357, -0.207, 0.093, 0.343, -1.714, 1.148, 2.075, -2.925, -1.880, -3.035, 0.581),
 )
 """Per filter: 8 weights, one for each sector; a bias; the weights of its mean and its maximum over 8 rotations."""
+
+
+def limit_of(probability: float) -> float:
+    """The score of the filters at which a point is hidden with the given probability."""
+    p = min(max(probability, 1e-6), 1 - 1e-6)
+    return math.log(p / (1 - p)) - BIAS

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
-from diffpoint._horizon import BIAS, FILTERS, REACH
+from diffpoint._horizon import FILTERS, REACH, limit_of
 from diffpoint._runtime import runtime_info
 from diffpoint.camera import PinholeCamera, check_views
 from diffpoint.splat import splat_depth
@@ -144,15 +144,9 @@ def _visible(
         height,
         width,
         radius,
-        _limit(tolerance),
+        limit_of(tolerance),
     )
     return visible.view(torch.bool)
-
-
-def _limit(probability: float) -> float:
-    """The score of the filters at which a point is hidden with the given probability."""
-    p = min(max(probability, 1e-6), 1 - 1e-6)
-    return math.log(p / (1 - p)) - BIAS
 
 
 def _on_flipped_hull(

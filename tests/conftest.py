@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads would slow the kernels
@@ -17,6 +18,26 @@ import pytest
 
 if TYPE_CHECKING:
     from train.data.batches import LoadedSplit
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--cuda-kernels",
+        action="store_true",
+        help="run the layer's tests with the kernels for CUDA, in Triton's interpreter (slow)",
+    )
+
+
+@pytest.fixture(autouse=True)
+def _chosen_kernels(request: pytest.FixtureRequest) -> Iterator[None]:
+    """The kernels for CUDA if the command line asks for them."""
+    if not request.config.getoption("--cuda-kernels"):
+        yield
+        return
+    from diffpoint.testing import cuda_kernels_interpreted
+
+    with cuda_kernels_interpreted():
+        yield
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -174,6 +174,23 @@ def test_soft_splat(dtype, radius, softness):
     assert_same(outputs, points, lengths)
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_horizon(dtype):
+    generator = torch.Generator().manual_seed(0)
+    points = torch.nn.functional.normalize(torch.randn(2, 400, 3, generator=generator, dtype=dtype), dim=-1) / 2
+    lengths = torch.tensor([400, 250])
+    camera = dp.PinholeCamera.look_at(
+        torch.tensor([[0.0, 0, -2], [2, 0.3, 0]]), focal_px=50.0, height=64, width=64
+    )
+
+    def outputs(points, lengths):
+        return [dp.visible_points(points, camera.to(dtype), method="horizon", lengths=lengths)]
+
+    (here,), (there,) = outputs(points, lengths), on_cpu(outputs, points, lengths)
+    assert 0.2 < there.double().mean() < 0.6
+    assert (here != there).double().mean() < 0.002  # logarithms are rounded differently
+
+
 # The last test: it compiles what the others have launched.
 @pytest.mark.skipif(ON_GPU, reason="they have been compiled to run")
 def test_kernels_compile_without_a_gpu(tmp_path):

@@ -15,6 +15,7 @@ _MODULES = {
     "splat": ("splat", "splat_backward"),
     "sampling": ("farthest_point_sample",),
     "soft_splat": ("soft_splat", "soft_splat_backward"),
+    "visibility": ("visible",),
     "views": ("sample_view", "sample_view_backward"),
     "reproject": (
         "project", "project_backward", "unproject", "unproject_backward", "reproject", "reproject_backward",

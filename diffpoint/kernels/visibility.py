@@ -6,13 +6,11 @@ in pixels, at any distance of the object. w is +inf for points that are not in t
 
 from types import SimpleNamespace
 
+from diffpoint._horizon import CELL, DEEP
 from diffpoint.kernels._backend import ti
 
 FILTERS = 8
 """Number of filters of the horizon test; each is applied at the 8 rotations of the sectors."""
-CELL, DEEP = 2.5, 1.5
-"""Cells have this side, in spacings of the points; a point is enclosed if on two of the four lines through its cell the
-cells on both sides are this much nearer."""
 _LANES = 16  # points scored at once in the horizon test: one vector register
 
 
