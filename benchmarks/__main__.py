@@ -2,6 +2,7 @@
 
 Parts: races (with each op's extra memory), memory (its growth), dispatch (of torch operators), sweep (over the number
 of points), train (a training step). `publish` puts the tables of the last run into README.md and docs/performance.md.
+`gpu` measures a GPU instead, within --minutes, and tests the kernels on it.
 """
 
 from __future__ import annotations
@@ -27,19 +28,25 @@ def main() -> int:
     parser.add_argument("--only", default="", metavar="WORD", help="only races whose op contains this word")
     parser.add_argument("--seconds", type=float, default=2.0, help="time for each race (default: 2)")
     parser.add_argument("--quick", action="store_true", help="few runs in two or three minutes, not saved")
+    parser.add_argument("--minutes", type=float, default=8.0, help="gpu: time for everything (default: 8)")
     parser.add_argument(
         "--out", type=Path, default=Path(__file__).parent / "results", help="where results go"
     )
     arguments = parser.parse_args()
     parts: list[str] = arguments.parts or (["races"] if arguments.only else list(PARTS))
-    if unknown := set(parts) - {*PARTS, "publish"}:
-        parser.error(f"no such part: {', '.join(sorted(unknown))} (parts: {', '.join(PARTS)}; or publish)")
+    if unknown := set(parts) - {*PARTS, "publish", "gpu"}:
+        names = ", ".join(PARTS)
+        parser.error(f"no such part: {', '.join(sorted(unknown))} (parts: {names}; or publish, or gpu)")
     warnings.filterwarnings("ignore", category=UserWarning, module="numba")
 
     if parts == ["publish"]:
         from benchmarks.publish import publish
 
         return publish(arguments.out)
+    if parts == ["gpu"]:
+        from benchmarks import gpu
+
+        return gpu.main(arguments.out, minutes=arguments.minutes)
     return _measure(parts, arguments)
 
 

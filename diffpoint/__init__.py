@@ -1,5 +1,6 @@
 """Differentiable point-cloud rendering and shape distances for PyTorch, fast on a plain CPU."""
 
+from diffpoint._bridge import check_pending
 from diffpoint._runtime import RuntimeInfo, configure, runtime_info
 from diffpoint.camera import PinholeCamera, PointSets, Projection
 from diffpoint.distances import Chamfer, Nearest, chamfer_distance, nearest
@@ -40,6 +41,7 @@ __all__ = [
     "ViewSample",
     "approxmatch",
     "chamfer_distance",
+    "check_pending",
     "configure",
     "consistency_loss",
     "diversity_loss",

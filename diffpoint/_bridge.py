@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import sys
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -112,6 +113,23 @@ def _cuda_kernel(name: str) -> Callable | None:
     except ImportError as error:
         _warn_without_triton(str(error))
         return None
+
+
+def check_pending() -> None:
+    """Wait for the CUDA devices, and raise the first error that their kernels have found in the values of a tensor.
+
+    Ops on CUDA tensors do not wait for the answers to their checks (see `configure`): call this before you save what
+    came of them. Without CUDA tensors it does nothing: on the CPU every op raises its own errors at once.
+
+    Raises:
+        ValueError: an earlier op met NaN, an infinity or a length out of range.
+
+    Example:
+        >>> check_pending()
+    """
+    errors = sys.modules.get("diffpoint.cuda.errors")
+    if errors is not None:
+        errors.check_pending()
 
 
 @functools.cache  # once in a process

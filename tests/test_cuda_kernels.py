@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -9,13 +10,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from test_operators import operator_arguments
 
 import diffpoint as dp
 from diffpoint import _bridge
 from diffpoint.testing import assert_close, cuda_kernels_interpreted
 
 pytest.importorskip("triton", reason="triton has no wheel here")
-from diffpoint.cuda import launch  # noqa: E402
+from diffpoint.cuda import _MODULE_OF as kernels_of_operators
+from diffpoint.cuda import errors, launch
 
 # The interpreter computes with numpy, which warns of infinities.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -23,6 +26,9 @@ ON_GPU = torch.cuda.is_available()
 DEVICE = "cuda" if ON_GPU else "cpu"
 DTYPES = (torch.float32, torch.float64)
 LAUNCHES: dict[str, dict] = {}
+OPERATORS = operator_arguments()
+WITHOUT_KERNEL = {"approxmatch", "earth_mover_distance"}
+"""Copied to the CPU and back."""
 
 
 @pytest.fixture(autouse=True)
@@ -177,7 +183,9 @@ def test_soft_splat(dtype, radius, softness):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_horizon(dtype):
     generator = torch.Generator().manual_seed(0)
-    points = torch.nn.functional.normalize(torch.randn(2, 400, 3, generator=generator, dtype=dtype), dim=-1) / 2
+    points = (
+        torch.nn.functional.normalize(torch.randn(2, 400, 3, generator=generator, dtype=dtype), dim=-1) / 2
+    )
     lengths = torch.tensor([400, 250])
     camera = dp.PinholeCamera.look_at(
         torch.tensor([[0.0, 0, -2], [2, 0.3, 0]]), focal_px=50.0, height=64, width=64
@@ -189,6 +197,75 @@ def test_horizon(dtype):
     (here,), (there,) = outputs(points, lengths), on_cpu(outputs, points, lengths)
     assert 0.2 < there.double().mean() < 0.6
     assert (here != there).double().mean() < 0.002  # logarithms are rounded differently
+
+
+@pytest.mark.parametrize("name", sorted(set(OPERATORS) - WITHOUT_KERNEL))
+def test_operators_pass_opcheck(name):
+    assert name in kernels_of_operators
+    arguments = on_cpu(operator_arguments)[name]
+    moved = [
+        x.detach().to(DEVICE).requires_grad_(x.requires_grad) if torch.is_tensor(x) else x for x in arguments
+    ]
+    torch.library.opcheck(getattr(torch.ops.diffpoint, name).default, tuple(moved))
+
+
+POINTS = torch.rand(2, 40, 3)
+BAD = POINTS.index_fill(1, torch.tensor([3]), torch.nan)
+SHORT = torch.tensor([40, 41])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: dp.nearest(BAD, POINTS), "nearest: 'a' must be finite; got nan at index"),
+        (lambda: dp.nearest(POINTS, POINTS, b_lengths=SHORT), "nearest: 'b_lengths' must lie in"),
+        (lambda: dp.chamfer_distance(POINTS, BAD, squared=True), "chamfer_distance: 'b' must be finite"),
+        (lambda: dp.chamfer_distance(POINTS, POINTS[:, :0], squared=True), "'b' must hold at least one point"),
+        (lambda: dp.chamfer_distance(POINTS, POINTS, squared=True, a_lengths=SHORT * 0), "empty set has no"),
+        (lambda: dp.splat_depth(BAD, CAMERA), "splat_depth: 'points' must be finite"),
+        (lambda: dp.splat_depth(POINTS, CAMERA, lengths=SHORT), "splat_depth: 'lengths' must lie in"),
+        (lambda: dp.sample_view(BAD, torch.ones(2, 1, 40) > 0), "sample_view: 'points' must be finite"),
+        (lambda: dp.project(BAD, CAMERA), "project: 'points' must be finite"),
+        (lambda: dp.unproject(torch.zeros(1, 2, 16, 14), CAMERA), "unproject: 'depth' must be positive"),
+        (lambda: dp.reproject(torch.zeros(1, 2, 16, 14), CAMERA, CAMERA), "reproject: 'depth' must be positive"),
+        (lambda: dp.farthest_point_sample(BAD, 5), "farthest_point_sample: 'points' must be finite"),
+        (lambda: dp.farthest_point_sample(POINTS, 41), "'k' must be at most 40"),
+        (lambda: dp.soft_splat(POINTS, CAMERA, lengths=SHORT), "soft_splat: 'lengths' must lie in"),
+        (lambda: dp.visible_points(BAD, CAMERA, method="horizon"), "visible_points: 'points' must be finite"),
+    ],
+)  # fmt: skip
+@pytest.mark.skipif(ON_GPU, reason="on a GPU errors arrive later")
+def test_values_that_are_not_allowed_are_named(call, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        call()
+    dp.nearest(POINTS, POINTS)  # and only once
+
+
+def test_errors_arrive_without_a_wait():
+    """What `settle` does on a GPU by default; on the CPU a copy arrives at once."""
+    state = errors._Counters(torch.device(DEVICE))
+    errors._poll(state)
+    errors._poll(state)
+    slot = errors._names.setdefault(("splat_depth", "points", "finite"), len(errors._names))
+    state.values[slot] += 3
+    errors._poll(state)  # a look at the copy from before, and a new copy
+    if ON_GPU:
+        torch.cuda.synchronize()
+    with pytest.raises(
+        ValueError, match=r"splat_depth: 'points' must be finite; got 3 that are not\. An operator has"
+    ):
+        errors._poll(state)
+    errors._poll(state)
+    assert not state.values.any()
+
+
+def test_the_cpu_never_imports_triton():
+    code = (
+        "import sys, torch, diffpoint as dp; a = torch.rand(1, 9, 3); "
+        "dp.chamfer_distance(a, a, squared=True); dp.check_pending(); "
+        "assert not [m for m in sys.modules if m.startswith(('triton', 'diffpoint.cuda'))]"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])
 
 
 # The last test: it compiles what the others have launched.

@@ -18,8 +18,13 @@ _MODULES = {
     "visibility": ("visible",),
     "views": ("sample_view", "sample_view_backward"),
     "reproject": (
-        "project", "project_backward", "unproject", "unproject_backward", "reproject", "reproject_backward",
-    ),  # fmt: skip
+        "project",
+        "project_backward",
+        "unproject",
+        "unproject_backward",
+        "reproject",
+        "reproject_backward",
+    ),
 }
 _MODULE_OF = {operator: module for module, operators in _MODULES.items() for operator in operators}
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import atexit
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,7 +35,7 @@ class _Counters:
         self.values = torch.zeros(_COUNTERS, dtype=torch.int32, device=device)
         on_gpu = device.type == "cuda"
         self.copy = torch.zeros(_COUNTERS, dtype=torch.int32, pin_memory=on_gpu)
-        self.arrived: torch.cuda.Event | None = None
+        self.arrived: Any = None  # an event of the stream that the copy was queued in
 
 
 _names: dict[tuple[str, str, str], int] = {}
@@ -45,6 +46,19 @@ def counter(like: Tensor, function: str, argument: str, kind: str) -> Tensor:
     """The counter (1,) int32 of a kind of error, on the device of `like`; a kernel adds 1 or more to it."""
     slot = _names.setdefault((function, argument, kind), len(_names))
     return _of(like.device).values[slot : slot + 1]
+
+
+def defer(bad: Tensor, function: str, argument: str, kind: str) -> bool:
+    """Counts the flags `bad` on their device unless the settings ask for an answer now; returns whether it did."""
+    if RUNTIME.checks == "immediate":
+        return False
+    if RUNTIME.checks == "deferred" and not _capturing(bad.device):
+        counter(bad, function, argument, kind).add_(bad.sum())
+        _poll(_of(bad.device))
+    return True
+
+
+_checks.defer = defer
 
 
 def settle(like: Tensor, name_it: Callable[[], object]) -> None:
@@ -68,23 +82,11 @@ def settle(like: Tensor, name_it: Callable[[], object]) -> None:
             name_it()
             _raise(found, "")
         return
-    if state.arrived is not None:
-        if not state.arrived.query():
-            return
-        _look_at(state)
-    state.copy.copy_(state.values, non_blocking=True)
-    state.arrived = torch.cuda.Event()
-    state.arrived.record()
+    _poll(state)
 
 
 def check_pending() -> None:
-    """Waits for the CUDA devices, and raises the first error in values that their kernels have found.
-
-    Without CUDA tensors it does nothing: on the CPU every operator raises its own errors at once.
-
-    Raises:
-        ValueError: an earlier operator met a bad value.
-    """
+    """See `diffpoint.check_pending`."""
     for state in _counters.values():
         state.copy.copy_(state.values)
         _look_at(state)
@@ -98,6 +100,17 @@ def _of(device: torch.device) -> _Counters:
 
 def _capturing(device: torch.device) -> bool:
     return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
+
+def _poll(state: _Counters) -> None:
+    """Looks at the last copy of the counters if it has arrived, and sends for the next."""
+    if state.arrived is not None:
+        if not state.arrived.query():
+            return
+        _look_at(state)
+    state.copy.copy_(state.values, non_blocking=True)
+    state.arrived = torch.get_device_module(state.values.device).Event()
+    state.arrived.record()
 
 
 def _look_at(state: _Counters) -> None:

@@ -10,7 +10,7 @@ import triton
 import triton.language as tl
 
 recorded: list[tuple[Any, tuple, int]] | None = None
-"""If a list, every launch is appended to it: kernel, arguments, warps. For the test that compiles them without a GPU."""
+"""If a list, it receives every launch: kernel, arguments, warps. For the test that compiles them without a GPU."""
 
 
 def launch(kernel: Any, programs: int, *arguments: Any, warps: int = 4) -> None:

@@ -86,7 +86,7 @@ def _project_to_points(
     gx = tl.zeros((BLOCK,), points.dtype.element_ty)
     gy = tl.zeros((BLOCK,), points.dtype.element_ty)
     gz = tl.zeros((BLOCK,), points.dtype.element_ty)
-    for of_cloud in range(0, views):
+    for of_cloud in range(views):
         view = cloud * views + of_cloud
         m = projection + view * 12
         target = view * count + i
@@ -197,9 +197,7 @@ def _unproject_to_depth(
 
 
 @triton.jit
-def _unproject_to_camera(
-    depth, order, grad_points, grad_back_projection, height, width, BLOCK: tl.constexpr
-):
+def _unproject_to_camera(depth, order, grad_points, grad_back_projection, height, width, BLOCK: tl.constexpr):
     """One row of the gradient to the camera of one view."""
     view = (tl.program_id(0) // 3).to(tl.int64)
     k = tl.program_id(0) % 3
@@ -270,8 +268,8 @@ def _reproject(
 def _reproject_gradients(
     depth, back_projection, projection, grad_points, grad_pixels, grad_seen, view, p, height, width,
 ):  # fmt: skip
-    """Gradients to the target's rows times (x, y, z, 1) and to the world points, zero where the map is empty; the pixel,
-    its depth (0 where empty) and its world point."""
+    """Gradients to the target's rows times (x, y, z, 1) and to the world points, zero where the map is empty; then the
+    pixel, its depth (0 where empty) and its world point."""
     size = height * width
     at = view * size + p
     d = tl.load(depth + at, mask=p < size, other=float("inf"))

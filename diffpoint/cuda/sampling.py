@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
@@ -28,7 +27,7 @@ def _farthest(points, lengths, chosen, size, picks, start, BLOCK: tl.constexpr):
     z = tl.load(points + i * 3 + 2, mask=inside, other=0.0)
     distance = tl.where(inside, float("inf"), -1.0).to(x.dtype)
     current = tl.minimum(start, size - 1)
-    for pick in range(0, picks):
+    for pick in range(picks):
         tl.store(chosen + cloud * picks + pick, current.to(tl.int64))
         dx = x - tl.load(points + current * 3)
         dy = y - tl.load(points + current * 3 + 1)
@@ -46,7 +45,7 @@ def _farthest_of_many(points, lengths, distance, chosen, size, picks, start, TIL
     length = tl.minimum(tl.load(lengths + cloud), size).to(tl.int32)
     dtype: tl.constexpr = points.dtype.element_ty
     current = tl.minimum(start, size - 1)
-    for pick in range(0, picks):
+    for pick in range(picks):
         tl.store(chosen + cloud * picks + pick, current.to(tl.int64))
         px = tl.load(points + current * 3)
         py = tl.load(points + current * 3 + 1)

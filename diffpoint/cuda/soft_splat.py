@@ -153,7 +153,9 @@ def soft_splat(
     batch, views, count = point_depth.shape
     shape = batch, views, height, width
     if point_depth.numel() == 0 or height * width == 0:
-        depth, coverage, nearest, weight = (point_depth.new_full(shape, x) for x in (math.inf, 0.0, math.inf, 0.0))
+        depth, coverage, nearest, weight = (
+            point_depth.new_full(shape, x) for x in (math.inf, 0.0, math.inf, 0.0)
+        )
         return depth, coverage, nearest, weight
     depth, coverage, nearest, weight = (point_depth.new_empty(shape) for _ in range(4))
     inputs = pixels, point_depth, lengths, depth, coverage, nearest, weight

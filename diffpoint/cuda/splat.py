@@ -34,9 +34,11 @@ def _offer(
     views, count, height, width, radius_bits, reach,
     DISC: tl.constexpr, PACKED: tl.constexpr, SECOND: tl.constexpr, POINTS: tl.constexpr,
 ):  # fmt: skip
-    """Some points of one view. PACKED: depth and index form one key in `keys`, and the smallest key wins. Else depth and
-    index need 128 bits and two launches: the first finds the nearest depth of each pixel, the second (SECOND) the
-    lowest index among the points that have it. The bits of positive floats are ordered as the floats are."""
+    """Some points of one view. PACKED: depth and index form one key in `keys`, and the smallest key wins.
+
+    Else they need 128 bits and two launches: the first finds the nearest depth of each pixel, the second (SECOND) the
+    lowest index among the points that have it. The bits of positive floats are ordered as the floats are.
+    """
     tiles = tl.cdiv(count, POINTS)
     view = (tl.program_id(0) // tiles).to(tl.int64)
     cloud = view // views
@@ -92,7 +94,7 @@ def _offer(
 
 @triton.jit
 def _decode(keys, depth_bits, index, visible, pixels, count, PACKED: tl.constexpr, PIXELS: tl.constexpr):
-    """Depth, index and visibility from the keys; PACKED as above. Several pixels may set a point's flag: to the same."""
+    """Depth, index and visibility from the keys, PACKED as above. Several pixels may set a point's flag, all to 1."""
     blocks = tl.cdiv(pixels, PIXELS)
     view = (tl.program_id(0) // blocks).to(tl.int64)
     p = tl.program_id(0) % blocks * PIXELS + tl.arange(0, PIXELS)
@@ -110,7 +112,17 @@ def _decode(keys, depth_bits, index, visible, pixels, count, PACKED: tl.constexp
 
 @triton.jit
 def _to_points(
-    points, projection, index, grad_depth, grad_points, views, count, height, width, reach, POINTS: tl.constexpr
+    points,
+    projection,
+    index,
+    grad_depth,
+    grad_points,
+    views,
+    count,
+    height,
+    width,
+    reach,
+    POINTS: tl.constexpr,
 ):
     """Gradient to some points of a cloud: each gathers from the pixels around it that it owns, because atomic additions
     would be in another order in every run."""
@@ -125,7 +137,7 @@ def _to_points(
     gx = tl.zeros((POINTS,), dtype)
     gy = tl.zeros((POINTS,), dtype)
     gz = tl.zeros((POINTS,), dtype)
-    for of_cloud in range(0, views):
+    for of_cloud in range(views):
         view = cloud * views + of_cloud
         camera = projection + view * 12
         u, v, d = image_position(camera, x, y, z)
@@ -195,9 +207,14 @@ def splat(
         depth, index = torch.empty_like(keys, dtype=torch.float32), torch.empty_like(keys)
         depth_bits = depth.view(torch.int32)
     else:
-        depth, index = points.new_full(shape, math.inf), points.new_full(shape, _NOBODY.value, dtype=torch.int64)
+        depth, index = (
+            points.new_full(shape, math.inf),
+            points.new_full(shape, _NOBODY.value, dtype=torch.int64),
+        )
         depth_bits = keys = depth.view(torch.int64)
-    counters = [errors.counter(points, "splat_depth", *kind) for kind in (("points", "finite"), ("lengths", "length"))]
+    counters = [
+        errors.counter(points, "splat_depth", *kind) for kind in (("points", "finite"), ("lengths", "length"))
+    ]
     inputs = points, lengths, projection, keys, depth_bits, index, *counters
     sizes = views, count, height, width, bits_of(radius), _reach(radius)
     programs = rows * triton.cdiv(count, _POINTS)

@@ -15,9 +15,7 @@ _POINTS = 256  # of a program
 
 
 @triton.jit
-def _gather(
-    points, visible, order, sampled, index, not_finite, views, count, largest, POINTS: tl.constexpr
-):
+def _gather(points, visible, order, sampled, index, not_finite, views, count, largest, POINTS: tl.constexpr):
     """The visible points among some points of a view go to their places, which `order` (from 1) gives."""
     tiles = tl.cdiv(count, POINTS)
     view = (tl.program_id(0) // tiles).to(tl.int64)
@@ -46,7 +44,7 @@ def _to_points(slot, grad_sampled, grad_points, views, count, largest, POINTS: t
     gx = tl.zeros((POINTS,), grad_points.dtype.element_ty)
     gy = tl.zeros((POINTS,), grad_points.dtype.element_ty)
     gz = tl.zeros((POINTS,), grad_points.dtype.element_ty)
-    for of_cloud in range(0, views):
+    for of_cloud in range(views):
         view = cloud * views + of_cloud
         at = tl.load(slot + view * (count + 1) + i, mask=i < count, other=-1)
         seen = at >= 0

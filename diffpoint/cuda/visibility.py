@@ -45,8 +45,11 @@ def _place(
     points, lengths, projection, image, spacing, cells, front, views, count, height, width,
     CELL: tl.constexpr, DEEP: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
-    """One program per view: fills `image` and the spacing of the points. Points are enclosed if on two of the four lines
-    through their cell the cells on both sides are nearer by DEEP spacings."""
+    """One program per view: fills `image` and the spacing of the points.
+
+    A point is enclosed if the cells on both sides of its own are nearer by DEEP spacings, on two of the four lines
+    through it.
+    """
     view = tl.program_id(0).to(tl.int64)
     camera = projection + view * 12
     points += view // views * count * 3
