@@ -9,10 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffpoint import _checks, _transforms
 from diffpoint._runtime import RUNTIME
 
 _REALS = {torch.float32: "f32", torch.float64: "f64"}
 _LARGEST = 2**31 - 1
+_NUMBER = torch.zeros(())  # on the CPU
 
 
 def launch(module: str, kernel: str, real: torch.dtype, *arguments: Tensor | int | float) -> None:
@@ -68,6 +70,7 @@ def register(
         op.register_fake(fake)
         if backward is not None:
             op.register_autograd(backward, setup_context=setup)
+        _transforms.support(op, name, backward, setup)
         return op
 
     return decorate
@@ -80,7 +83,8 @@ def _on_cpu_tensors(function: Callable, strided: bool) -> Callable:
         here = [a.cpu() if isinstance(a, Tensor) else a for a in arguments]
         if not strided:
             here = [a.contiguous() if isinstance(a, Tensor) else a for a in here]
-        results = function(*here)
+        with _checks.full_precision(_NUMBER):
+            results = function(*here)
         if not elsewhere:
             return results
         if isinstance(results, Tensor):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import Any
 
@@ -14,6 +15,38 @@ FLOATS = (torch.float32, torch.float64)
 def fail(function: str, argument: str, expected: str, got: str, hint: str = "") -> ValueError:
     """The error that the checks raise, in one format."""
     return ValueError(f"{function}: '{argument}' must {expected}; got {got}." + (f" {hint}" if hint else ""))
+
+
+def readable(*values: Tensor) -> bool:
+    """Whether Python can read values of these: not while torch traces, nor where `torch.vmap` maps over them."""
+    if torch.compiler.is_compiling():
+        return False
+    return torch._C._functorch.maybe_current_level() is None or not any(_is_mapped(v) for v in values)
+
+
+def _is_mapped(value: Tensor) -> bool:
+    functorch = torch._C._functorch
+    while functorch.is_functorch_wrapped_tensor(value):
+        if functorch.is_batchedtensor(value):
+            return True
+        value = functorch.get_unwrapped(value)
+    return False
+
+
+def differentiated(*values: Tensor) -> bool:
+    """Whether a gradient with respect to one of these may be asked for; in doubt, yes."""
+    if not torch.is_grad_enabled():
+        return False
+    transformed = torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None
+    return transformed or any(v.requires_grad for v in values)
+
+
+def full_precision(like: Tensor) -> contextlib.AbstractContextManager:
+    """Matrices are multiplied in their own dtype inside, whatever `torch.autocast` says."""
+    device = like.device.type
+    if torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device):
+        return torch.autocast(device, enabled=False)
+    return contextlib.nullcontext()
 
 
 def check_tensor(function: str, name: str, value: Any, shape: tuple[int | str, ...]) -> Tensor:
@@ -91,8 +124,11 @@ def check_lengths_range(function: str, name: str, lengths: Tensor, largest: int,
 
 
 def check_finite(function: str, name: str, value: Tensor, lengths: Tensor | None = None) -> None:
-    """No NaN or infinity among the first `lengths` points. A finite sum is enough; only else are all values read."""
-    if value.numel() == 0 or math.isfinite(float(value.sum())):
+    """No NaN or infinity among the first `lengths` points. A finite sum is enough; only else are all values read.
+
+    Not where `value` is not `readable`.
+    """
+    if value.numel() == 0 or not readable(value) or math.isfinite(float(value.sum())):
         return
     bad = ~torch.isfinite(value)
     if lengths is not None:

@@ -64,12 +64,13 @@ class PinholeCamera:
                 f"have leading dimensions that fit those of 'K' {tuple(self.K.shape[:-2])}",
                 str(tuple(self.cam_from_world.shape[:-2])),
             ) from None
-        if not torch.compiler.is_compiling():
-            self._check_last_rows()
+        self._check_last_rows()
 
     def _check_last_rows(self) -> None:
         for name, value in (("K", self.K), ("cam_from_world", self.cam_from_world)):
             value = value.detach()
+            if not _checks.readable(value):
+                continue
             _checks.check_finite("PinholeCamera", name, value)
             row = value[..., -1, :]
             wanted = _last_row(row.shape[-1], value.dtype, value.device)
@@ -101,7 +102,9 @@ class PinholeCamera:
         )
         forward = towards - at
         right = torch.linalg.cross(forward, upward)
-        if bool((forward.norm(dim=-1) == 0).any()) or bool((right.norm(dim=-1) < 1e-9).any()):
+        if _checks.readable(forward, right) and (
+            bool((forward.norm(dim=-1) == 0).any()) or bool((right.norm(dim=-1) < 1e-9).any())
+        ):
             raise _checks.fail(
                 "PinholeCamera.look_at",
                 "up",
@@ -115,7 +118,8 @@ class PinholeCamera:
         rotation = torch.stack((right, down, forward), dim=-2)
         cam_from_world = at.new_zeros((*at.shape[:-1], 4, 4))
         cam_from_world[..., :3, :3] = rotation
-        cam_from_world[..., :3, 3] = -(rotation @ at[..., None])[..., 0]
+        with _checks.full_precision(at):
+            cam_from_world[..., :3, 3] = -(rotation @ at[..., None])[..., 0]
         cam_from_world[..., 3, 3] = 1
         K = at.new_tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]]).expand(
             *at.shape[:-1], 3, 3
@@ -131,7 +135,9 @@ class PinholeCamera:
             >>> PinholeCamera.from_opengl(torch.eye(3), gl, 4, 4).position.tolist()
             [0.0, 0.0, 2.0]
         """
-        return cls(K, cam_from_world.new_tensor(_FLIP_YZ) @ cam_from_world, height, width)
+        with _checks.full_precision(cam_from_world):
+            flipped = cam_from_world.new_tensor(_FLIP_YZ) @ cam_from_world
+        return cls(K, flipped, height, width)
 
     @classmethod
     def from_pytorch3d(cls, R: Tensor, T: Tensor, K: Tensor, height: int, width: int) -> PinholeCamera:
@@ -148,7 +154,9 @@ class PinholeCamera:
         view_from_world[..., :3, :3] = R.transpose(-1, -2)
         view_from_world[..., :3, 3] = T
         view_from_world[..., 3, 3] = 1
-        return cls(K, R.new_tensor(_FLIP_XY) @ view_from_world, height, width)
+        with _checks.full_precision(R):
+            flipped = R.new_tensor(_FLIP_XY) @ view_from_world
+        return cls(K, flipped, height, width)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -170,13 +178,15 @@ class PinholeCamera:
     @property
     def projection(self) -> Tensor:
         """(..., 3, 4): (u d, v d, d) = projection @ (x, y, z, 1), with depth d, for world points."""
-        return self.K @ self.cam_from_world[..., :3, :]
+        with _checks.full_precision(self.K):
+            return self.K @ self.cam_from_world[..., :3, :]
 
     @property
     def back_projection(self) -> Tensor:
         """(..., 3, 4): world point = d * (M[:, :3] @ (u, v, 1)) + M[:, 3] for the pixel position (u, v) at depth d."""
         world_from_cam = _inverse("cam_from_world", self.cam_from_world)
-        rays = world_from_cam[..., :3, :3] @ _inverse("K", self.K)
+        with _checks.full_precision(self.K):
+            rays = world_from_cam[..., :3, :3] @ _inverse("K", self.K)
         origin = world_from_cam[..., :3, 3:].expand(*rays.shape[:-1], 1)
         return torch.cat((rays, origin), dim=-1)
 
@@ -217,7 +227,7 @@ def _last_row(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 def _inverse(name: str, matrix: Tensor) -> Tensor:
     inverse, singular = torch.linalg.inv_ex(matrix)
-    if not torch.compiler.is_compiling() and bool(singular.any()):
+    if _checks.readable(singular) and bool(singular.any()):
         got = matrix.detach()[singular > 0][0].tolist() if matrix.dim() > 2 else matrix.tolist()
         raise _checks.fail("PinholeCamera", name, "be invertible", str(got), "Is a focal length 0?")
     return inverse

@@ -227,7 +227,7 @@ def _distance_to(foreground: Tensor, margin: int) -> Tensor:
     pixels = pixels.to(foreground.device, torch.float32)
     flat = foreground.reshape(-1, height * width)
     counts = flat.sum(1)
-    longest = int(counts.max()) if len(flat) else 0
+    longest = int(counts.max()) if len(flat) and _checks.readable(counts) else height * width
     first = flat.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :longest]
     squared = nearest(pixels.expand(len(flat), -1, -1), pixels[first], b_lengths=counts).squared_distance
     distance = torch.where(torch.isfinite(squared), squared, 1.0).sqrt().view(foreground.shape)
@@ -248,12 +248,10 @@ def _check(
     check_maps(function, points, camera, depth)
     if not 0 <= mask_weight < float("inf"):
         raise _checks.fail(function, "mask_weight", "be a finite number of at least 0", repr(mask_weight))
-    if not torch.compiler.is_compiling():
-        check_depth(function, "depth", depth.detach())
+    check_depth(function, "depth", depth.detach())
 
 
 def _check_logits(logits: Tensor, points: Tensor) -> None:
     _checks.check_tensor("projection_loss", "logits", logits, (points.shape[0], points.shape[1]))
     _checks.check_same_dtype("projection_loss", points=points, logits=logits)
-    if not torch.compiler.is_compiling():
-        _checks.check_finite("projection_loss", "logits", logits.detach())
+    _checks.check_finite("projection_loss", "logits", logits.detach())

@@ -317,7 +317,9 @@ def _reproject_backward(
 
 
 def check_depth(function: str, name: str, depth: Tensor) -> None:
-    """Depth maps hold positive numbers, and +inf where they are empty."""
+    """Depth maps hold positive numbers, and +inf where they are empty. Not checked where they are not `readable`."""
+    if not _checks.readable(depth):
+        return
     good = depth > 0
     if not bool(good.all()):
         where = tuple((~good).nonzero()[0].tolist())

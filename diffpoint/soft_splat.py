@@ -83,8 +83,7 @@ def soft_splat(
     if lengths is not None:  # the padding may hold NaN
         counts = torch.arange(points.shape[1], device=points.device) < lengths[:, None]
         points = torch.where(counts[..., None], points, 0.0)
-    if not torch.compiler.is_compiling():
-        _checks.check_finite("soft_splat", "points", points.detach())
+    _checks.check_finite("soft_splat", "points", points.detach())
     pixels, depth = project(points, camera)
     maps = _soft_splat(pixels, depth, whole, camera.height, camera.width, float(radius), float(softness))
     return SoftSplat(maps[0], maps[1])
