@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import numbers
+import operator
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -78,7 +81,9 @@ def check_shape(
     sizes = value.shape[value.dim() - len(free) :] if leading_ok else ()
     if not leading_ok or any(isinstance(s, int) and s != n for s, n in zip(free, sizes, strict=True)):
         wanted = "(" + ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
-        if not hint and value.dim() == len(shape) - 1:
+        if not hint and value.dim() and isinstance(free[-1], int) and value.shape[-1] != free[-1]:
+            hint = f"The last size must be {free[-1]}, not {value.shape[-1]}."
+        elif not hint and value.dim() == len(free) - 1:
             hint = "Did you forget to batch? Add the leading dimension with [None]."
         raise fail(function, name, f"have shape {wanted}", str(tuple(value.shape)), hint)
 
@@ -149,7 +154,7 @@ def check_sets(
 ) -> None:
     """The values of two batches of sets: lengths in range, and finite coordinates."""
     for name, cloud, lengths in (("a", a, a_lengths), ("b", b, b_lengths)):
-        if cloud.shape[1] < smallest:
+        if cloud.shape[1] < smallest and cloud.shape[0]:  # a batch of no sets has no empty one
             raise fail(function, name, "hold at least one point", str(tuple(cloud.shape)))
         check_lengths_range(function, f"{name}_lengths", lengths, cloud.shape[1], smallest)
         check_finite(function, name, cloud, lengths)
@@ -158,6 +163,37 @@ def check_sets(
 def check_clouds(function: str, name: str, value: Any) -> Tensor:
     """A batch of clouds (B, N, 3)."""
     return check_tensor(function, name, value, ("B", "N", 3))
+
+
+def check_number(
+    function: str, name: str, value: Any, expected: str, fits: Callable[[float], bool], hint: str = ""
+) -> float:
+    """A number of Python or numpy, of which `fits` is true; `expected` says it in words."""
+    if isinstance(value, Tensor):
+        hint = hint or f"Pass a number, for instance {name}.item()."
+        raise TypeError(
+            f"{function}: '{name}' must be a Python or numpy number; got a torch.Tensor, which would get no gradient. "
+            + hint
+        )
+    if isinstance(value, bool) or not isinstance(value, (numbers.Real, torch.SymFloat, torch.SymInt)):
+        raise TypeError(
+            f"{function}: '{name}' must be a Python or numpy number; got {value!r} ({type(value).__name__})."
+        )
+    if not fits(float(value)):
+        raise fail(function, name, expected, repr(value))
+    return float(value)
+
+
+def check_integer(function: str, name: str, value: Any, smallest: int) -> int:
+    """A whole number of Python or numpy, at least `smallest`."""
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < smallest:
+        expected = "be a positive integer" if smallest == 1 else f"be an integer of at least {smallest}"
+        raise fail(function, name, expected, repr(value))
+    return number
 
 
 def check_choice(function: str, name: str, value: str, choices: tuple[str, ...]) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+from diffpoint import _checks
 from diffpoint._backend import BACKENDS, backend_name, home_directory, import_backend, without_warnings
 from diffpoint._launch import FastCall
 
@@ -222,8 +223,8 @@ def configure(*, threads: int | None = None, cache: bool = True) -> None:
         >>> subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip()
         '1'
     """
-    if threads is not None and (not isinstance(threads, int) or isinstance(threads, bool) or threads < 1):
-        raise ValueError(f"configure: 'threads' must be a positive integer or None; got {threads!r}.")
+    if threads is not None:
+        threads = _checks.check_integer("configure", "threads", threads, 1)
     with RUNTIME.lock:
         if RUNTIME.program is not None:
             raise RuntimeError(

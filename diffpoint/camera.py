@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import NamedTuple
 
 import torch
@@ -52,9 +53,9 @@ class PinholeCamera:
         _checks.check_tensor("PinholeCamera", "cam_from_world", self.cam_from_world, ("*", 4, 4))
         _checks.check_same_dtype("PinholeCamera", K=self.K, cam_from_world=self.cam_from_world)
         for name in ("height", "width"):
-            size = getattr(self, name)
-            if not isinstance(size, int) or isinstance(size, bool) or size < 1:
-                raise _checks.fail("PinholeCamera", name, "be a positive integer", repr(size))
+            size = _checks.check_integer("PinholeCamera", name, getattr(self, name), 1)
+            if size is not getattr(self, name):  # a number of numpy
+                object.__setattr__(self, name, size)
         try:
             torch.broadcast_shapes(self.K.shape[:-2], self.cam_from_world.shape[:-2])
         except RuntimeError:
@@ -96,6 +97,14 @@ class PinholeCamera:
             >>> PinholeCamera.look_at((2.0, 0, 0), focal_px=100.0, height=8, width=8).cam_from_world[2].tolist()
             [-1.0, 0.0, 0.0, 2.0]
         """
+        focal_px = _checks.check_number(
+            "PinholeCamera.look_at",
+            "focal_px",
+            focal_px,
+            "be finite and not 0",
+            lambda f: math.isfinite(f) and f != 0,
+            "To differentiate with respect to a focal length, make the matrix yourself: PinholeCamera(K, ...).",
+        )
         at = _vector("eye", eye)
         at, towards, upward = torch.broadcast_tensors(
             at, _vector("target", target, at), _vector("up", up, at)

@@ -143,7 +143,7 @@ def _front_terms(
 ) -> FrontTerms:
     _checks.check_choice(function, "distance", distance, ("chamfer", "emd"))
     sets = front_sets(points, camera, depth, visibility=visibility)
-    if points.shape[1] == 0:
+    if points.shape[1] == 0 and points.shape[0]:
         raise _checks.fail(function, "points", "hold at least one point", str(tuple(points.shape)))
     kept = sets.observed_lengths > 0
     if not _checks.readable(kept, points):
@@ -264,8 +264,7 @@ def diversity_loss(
     _checks.check_tensor("diversity_loss", "codes", codes, ("R", "B", "D"))
     _checks.check_tensor("diversity_loss", "clouds", clouds, (*codes.shape[:2], "N", 3))
     _checks.check_same_dtype("diversity_loss", codes=codes, clouds=clouds)
-    if not math.isfinite(alpha):
-        raise _checks.fail("diversity_loss", "alpha", "be finite", repr(alpha))
+    alpha = _checks.check_number("diversity_loss", "alpha", alpha, "be finite", math.isfinite)
     _checks.check_finite("diversity_loss", "codes", codes.detach())
     first, second = _pairs("diversity_loss", "codes", codes.shape[0])
     apart = (codes[first] - codes[second]).norm(dim=-1)

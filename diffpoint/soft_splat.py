@@ -73,9 +73,7 @@ def soft_splat(
         True
     """
     _checks.check_clouds("soft_splat", "points", points)
-    for name, value in (("radius", radius), ("softness", softness)):
-        if not 0 < value < float("inf"):
-            raise _checks.fail("soft_splat", name, "be positive and finite", repr(value))
+    radius, softness = check_footprint("soft_splat", radius, softness)
     lengths = _checks.check_lengths(
         "soft_splat", "lengths", lengths, points.shape[:1], points.shape[1], points
     )
@@ -85,8 +83,17 @@ def soft_splat(
         points = torch.where(counts[..., None], points, 0.0)
     _checks.check_finite("soft_splat", "points", points.detach())
     pixels, depth = project(points, camera)
-    maps = _soft_splat(pixels, depth, whole, camera.height, camera.width, float(radius), float(softness))
+    maps = _soft_splat(pixels, depth, whole, camera.height, camera.width, radius, softness)
     return SoftSplat(maps[0], maps[1])
+
+
+def check_footprint(function: str, radius: float, softness: float) -> tuple[float, float]:
+    """Both are positive, finite numbers."""
+    radius, softness = (
+        _checks.check_number(function, name, value, "be positive and finite", lambda x: 0 < x < math.inf)
+        for name, value in (("radius", radius), ("softness", softness))
+    )
+    return radius, softness
 
 
 def _soft_splat_fake(
