@@ -184,14 +184,13 @@ def check_number(
     return float(value)
 
 
-def check_integer(function: str, name: str, value: Any, smallest: int) -> int:
-    """A whole number of Python or numpy, at least `smallest`."""
+def check_integer(function: str, name: str, value: Any, expected: str, smallest: int) -> int:
+    """A whole number of Python or numpy, at least `smallest`; `expected` says it in words."""
     try:
         number = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = None
     if number is None or number < smallest:
-        expected = "be a positive integer" if smallest == 1 else f"be an integer of at least {smallest}"
         raise fail(function, name, expected, repr(value))
     return number
 

@@ -53,7 +53,9 @@ class PinholeCamera:
         _checks.check_tensor("PinholeCamera", "cam_from_world", self.cam_from_world, ("*", 4, 4))
         _checks.check_same_dtype("PinholeCamera", K=self.K, cam_from_world=self.cam_from_world)
         for name in ("height", "width"):
-            size = _checks.check_integer("PinholeCamera", name, getattr(self, name), 1)
+            size = _checks.check_integer(
+                "PinholeCamera", name, getattr(self, name), "be a positive integer", 1
+            )
             if size is not getattr(self, name):  # a number of numpy
                 object.__setattr__(self, name, size)
         try:
