@@ -221,7 +221,13 @@ class PinholeCamera:
         )
 
     def __getitem__(self, item) -> PinholeCamera:
-        """Index the leading dimensions."""
+        """Index the leading dimensions; `camera[:, None]` makes one view for each cloud of N cameras.
+
+        Example:
+            >>> cameras = PinholeCamera(torch.eye(3), torch.eye(4).expand(5, 4, 4), 8, 8)
+            >>> cameras[2].batch_shape, cameras[1:].batch_shape, cameras[:, None].batch_shape
+            ((), (4,), (5, 1))
+        """
         shape = self.batch_shape
         if not shape:
             raise IndexError("PinholeCamera: a single camera has no leading dimension to index.")
@@ -294,7 +300,12 @@ def check_views(
         )
     own = shape[-1] if shape else 1
     if views is not None and own not in (1, views):
-        raise _checks.fail(function, name, f"have {views} views to match 'depth'", str(own))
+        hint = (
+            f"For one camera for each of the {batch} clouds pass {name}[:, None]."
+            if shape == (batch,)
+            else ""
+        )
+        raise _checks.fail(function, name, f"have {views} views to match 'depth'", str(own), hint)
     return Views(camera, (batch, own if views is None else views))
 
 
