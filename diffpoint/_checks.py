@@ -55,13 +55,24 @@ def full_precision(like: Tensor) -> contextlib.AbstractContextManager:
 def check_tensor(function: str, name: str, value: Any, shape: tuple[int | str, ...]) -> Tensor:
     """Type, dtype and shape of a float tensor. A string in `shape` is a free size; "*" any leading sizes."""
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{function}: '{name}' must be a torch.Tensor; got {type(value).__name__}.")
+        raise TypeError(f"{function}: '{name}' must be a torch.Tensor; got {_kind(value)}")
+    if value.is_nested or value.layout is not torch.strided:
+        kind = "nested" if value.is_nested else f"{value.layout}"
+        raise TypeError(
+            f"{function}: '{name}' must be a dense tensor; got a {kind} one. Pad it, or use .to_dense()."
+        )
     if value.dtype not in FLOATS:
         raise TypeError(
             f"{function}: '{name}' must be float32 or float64; got {value.dtype}. Convert it with .float()."
         )
     check_shape(function, name, value, shape)
     return value
+
+
+def _kind(value: Any) -> str:
+    """What a value that is no tensor is, as the end of a message."""
+    hint = " Convert it with torch.from_numpy." if type(value).__name__ == "ndarray" else ""
+    return f"{type(value).__name__}.{hint}"
 
 
 def check_device(function: str, name: str, value: Tensor, like: Tensor) -> None:
@@ -107,8 +118,8 @@ def check_lengths(
     if lengths is None:
         return None
     if not isinstance(lengths, torch.Tensor) or lengths.dtype not in (torch.int64, torch.int32):
-        what = lengths.dtype if isinstance(lengths, torch.Tensor) else type(lengths).__name__
-        raise TypeError(f"{function}: '{name}' must be an integer tensor (int64); got {what}.")
+        what = f"{lengths.dtype}." if isinstance(lengths, torch.Tensor) else _kind(lengths)
+        raise TypeError(f"{function}: '{name}' must be an integer tensor (int64); got {what}")
     if like is not None:
         check_device(function, name, lengths, like)
     if tuple(lengths.shape) != tuple(shape):

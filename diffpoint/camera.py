@@ -146,6 +146,7 @@ class PinholeCamera:
             >>> PinholeCamera.from_opengl(torch.eye(3), gl, 4, 4).position.tolist()
             [0.0, 0.0, 2.0]
         """
+        _checks.check_tensor("PinholeCamera.from_opengl", "cam_from_world", cam_from_world, ("*", 4, 4))
         with _checks.full_precision(cam_from_world):
             flipped = cam_from_world.new_tensor(_FLIP_YZ) @ cam_from_world
         return cls(K, flipped, height, width)
@@ -161,6 +162,8 @@ class PinholeCamera:
             >>> PinholeCamera.from_pytorch3d(R, T, K, 4, 4).position.tolist()
             [0.0, 0.0, -2.0]
         """
+        _checks.check_tensor("PinholeCamera.from_pytorch3d", "R", R, ("*", 3, 3))
+        _checks.check_tensor("PinholeCamera.from_pytorch3d", "T", T, ("*", 3))
         view_from_world = R.new_zeros((*R.shape[:-2], 4, 4))
         view_from_world[..., :3, :3] = R.transpose(-1, -2)
         view_from_world[..., :3, 3] = T
