@@ -69,14 +69,17 @@ def front_sets(
     seen = sample.points.expand(batch, views, -1, 3)
     lengths = sample.lengths.expand(batch, views)
     fallback = lengths == 0
-    if bool(fallback.any()):
+    readable = _checks.readable(points, depth, lengths)  # else the sizes must not depend on values
+    if not readable or bool(fallback.any()):
         extra = points.shape[1] - seen.shape[2]
         seen = torch.nn.functional.pad(seen, (0, 0, 0, extra))
         seen = torch.where(fallback[..., None, None], points[:, None], seen)
         lengths = torch.where(fallback, points.shape[1], lengths)
     observed, observed_lengths = unproject(depth, camera)
-    longest = int(observed_lengths.max()) if observed_lengths.numel() else 0
-    return FrontSets(seen, lengths, observed[:, :, :longest], observed_lengths, fallback)
+    if readable:
+        longest = int(observed_lengths.max()) if observed_lengths.numel() else 0
+        observed = observed[:, :, :longest]
+    return FrontSets(seen, lengths, observed, observed_lengths, fallback)
 
 
 class FrontTerms(NamedTuple):
@@ -140,10 +143,14 @@ def _front_terms(
 ) -> FrontTerms:
     _checks.check_choice(function, "distance", distance, ("chamfer", "emd"))
     sets = front_sets(points, camera, depth, visibility=visibility)
-    if points.shape[1] == 0:
+    if points.shape[1] == 0 and points.shape[0]:
         raise _checks.fail(function, "points", "hold at least one point", str(tuple(points.shape)))
     kept = sets.observed_lengths > 0
-    if not bool(kept.any()):
+    if not _checks.readable(kept, points):
+        # One point stands for each empty map; its loss is not used.
+        compared = sets._replace(observed_lengths=sets.observed_lengths.clamp(min=1))
+        loss = torch.where(kept, _compare_sets(compared, distance, tolerance), 0.0)
+    elif not bool(kept.any()):
         # Depends on `points`, so that the backward pass of such a batch gives zeros and does not fail.
         loss = points.new_zeros(kept.shape) + (0 * points).sum()
     elif bool(kept.all()):
@@ -192,8 +199,8 @@ def front_constraint(
 
     Returns:
         The loss in world units. A view whose depth map is empty has loss 0. In a view in which no predicted point is
-        visible the whole cloud is compared, which pulls it into view. Both raise a `RuntimeWarning`; `front_terms`
-        returns them instead.
+        visible the whole cloud is compared, which pulls it into view. Both raise a `RuntimeWarning`, except under
+        `torch.compile` and `torch.vmap`, which do not let it read values; `front_terms` returns them instead.
 
     Gradients: to x, y and z of the visible points; none through the choice of the points.
 
@@ -217,7 +224,7 @@ def front_constraint(
         (terms.fallback, "no predicted point is visible"),
         (terms.observed == 0, "the depth map is empty"),
     ):
-        if bool(happened.any()):
+        if _checks.readable(happened) and bool(happened.any()):
             where = tuple(happened.nonzero()[0].tolist())
             warnings.warn(
                 f"front_constraint: in {int(happened.sum())} of {happened.numel()} views {what}; "
@@ -257,10 +264,8 @@ def diversity_loss(
     _checks.check_tensor("diversity_loss", "codes", codes, ("R", "B", "D"))
     _checks.check_tensor("diversity_loss", "clouds", clouds, (*codes.shape[:2], "N", 3))
     _checks.check_same_dtype("diversity_loss", codes=codes, clouds=clouds)
-    if not math.isfinite(alpha):
-        raise _checks.fail("diversity_loss", "alpha", "be finite", repr(alpha))
-    if not torch.compiler.is_compiling():
-        _checks.check_finite("diversity_loss", "codes", codes.detach())
+    alpha = _checks.check_number("diversity_loss", "alpha", alpha, "be finite", math.isfinite)
+    _checks.check_finite("diversity_loss", "codes", codes.detach())
     first, second = _pairs("diversity_loss", "codes", codes.shape[0])
     apart = (codes[first] - codes[second]).norm(dim=-1)
     # From this distance on the hinge is 0, so the exact distance is not needed.

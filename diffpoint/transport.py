@@ -85,8 +85,7 @@ def earth_mover_distance(
     """
     name = "earth_mover_distance"
     a3, b3, la, lb, batch = paired_sets(name, a, b, a_lengths, b_lengths)
-    if not 0 < tolerance < 1:
-        raise _checks.fail(name, "tolerance", "lie between 0 and 1", repr(tolerance))
+    tolerance = _checks.check_number(name, "tolerance", tolerance, "lie between 0 and 1", lambda x: 0 < x < 1)
     prices, known_cost = _start(name, start, a, b)
     if enough is None:
         limit = a.new_full((a3.shape[0],), torch.inf)
@@ -95,7 +94,7 @@ def earth_mover_distance(
         _checks.check_same_dtype(name, a=a, enough=enough)
         limit = enough.detach().reshape(-1)
     cost, assignment, bound, converged, prices = _transport(
-        a3, b3, la, lb, prices, known_cost, limit, float(tolerance)
+        a3, b3, la, lb, prices, known_cost, limit, tolerance
     )
     return Transport(
         cost.reshape(batch),
