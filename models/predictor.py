@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import ClassVar, Protocol
 
+import torch
 from torch import Tensor, nn
 
 
@@ -62,6 +63,11 @@ class Predictor(nn.Module, ABC):
     def profile(self) -> str:
         """Name of the size this network was built to."""
         return self.config.profile
+
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are, and where its inputs must be."""
+        return next(self.parameters()).device
 
     @abstractmethod
     def forward(self, images: Tensor, codes: Tensor) -> Tensor:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads would slow the kernels
+os.environ.setdefault(
+    "DIFFPOINT_DEVICE", "cpu"
+)  # tests compare commands with functions; those of a GPU name it
 
 from pathlib import Path
 from typing import TYPE_CHECKING
