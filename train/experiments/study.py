@@ -149,10 +149,10 @@ class Study:
         """One of this study's splits on its device, moved there once."""
         if self.device == CPU:
             return split
-        (key,) = (key for key, found in self._splits.items() if found is split)
-        if ("moved", *key) not in self._splits:
-            self._splits["moved", *key] = split.to(self.device)
-        return self._splits["moved", *key]
+        (key,) = (("moved", *key) for key, found in self._splits.items() if found is split)
+        if key not in self._splits:
+            self._splits[key] = split.to(self.device)
+        return self._splits[key]
 
     # Trainings
 
