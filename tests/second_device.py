@@ -133,6 +133,7 @@ from train.evaluation.explore import explore  # noqa: E402
 from train.evaluation.inference import predict, reconstruct  # noqa: E402
 from train.evaluation.runs import load_autoencoder, load_generator, open_run, read_metrics  # noqa: E402
 from train.methods import METHODS, get_method, recipe  # noqa: E402
+from train.methods.base import Step, check_finite  # noqa: E402
 from train.methods.weights import weights_digest  # noqa: E402
 from train.training.trainer import Trainer, fit  # noqa: E402
 from train.training.validation import validate, validate_autoencoder  # noqa: E402
@@ -249,29 +250,37 @@ def a_step_waits_for_nothing_but_the_layer(data: Path, run: Path) -> None:
 
 @check
 def a_loss_that_is_not_finite_ends_the_training_before_anything_is_kept(data: Path, run: Path) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        config = dataclasses.replace(
-            with_steps(_WHOLE, 40), checkpoint_every=20, log_every=20, picture_every=0
-        )
-        taken = Trainer.train_step
+    """Found by the layer, whose error names an argument of its own; or by nobody until the next record."""
+    config = dataclasses.replace(with_steps(_WHOLE, 40), checkpoint_every=20, log_every=20, picture_every=0)
+    taken = Trainer.train_step
 
-        def spoilt(trainer: Trainer) -> dict[str, Tensor]:
+    def with_nan(trainer: Trainer) -> None:
+        with torch.no_grad():
+            next(trainer.state.network.parameters()).fill_(torch.nan)
+
+    def with_open_check(trainer: Trainer) -> None:
+        loss = torch.full((), torch.inf, device=SECOND)
+        check_finite(loss, "the loss is", Step(trainer.phase, trainer.step, checks=trainer.checks))
+
+    for spoil, what in ((with_nan, "predictions are"), (with_open_check, "the loss is")):
+
+        def spoilt(trainer: Trainer, spoil: Callable[[Trainer], None] = spoil) -> dict[str, Tensor]:
             if trainer.total_steps == 13:
-                with torch.no_grad():
-                    next(trainer.state.network.parameters()).fill_(torch.nan)
+                spoil(trainer)
             return taken(trainer)
 
         Trainer.train_step = spoilt  # type: ignore[method-assign]
-        try:
-            fit(data, Path(folder) / "run", config, progress=False, device=SECOND)
-        except UserError as error:
-            assert "stopped at step 13 of the stage: predictions are no longer finite" in str(error), error
-        else:
-            raise AssertionError("it went on")
-        finally:
-            Trainer.train_step = taken  # type: ignore[method-assign]
-        assert [record["step"] for record in read_metrics(Path(folder) / "run")] == [10]
-        assert not list((Path(folder) / "run" / "checkpoints").glob("step-*"))
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                fit(data, Path(folder) / "run", config, progress=False, device=SECOND)
+            except UserError as error:
+                assert f"stopped at step 13 of the stage: {what} no longer finite" in str(error), error
+            else:
+                raise AssertionError("it went on")
+            finally:
+                Trainer.train_step = taken  # type: ignore[method-assign]
+            assert [record["step"] for record in read_metrics(Path(folder) / "run")] == [10]
+            assert not list((Path(folder) / "run" / "checkpoints").glob("step-*"))
 
 
 @check
