@@ -48,7 +48,7 @@ def allow_tf32(allowed: bool) -> Iterator[None]:
     TF32 has 10 bits of mantissa and several times the speed. The switch is the whole process's: a backward pass rounds
     as the switch is when it runs.
     """
-    switches = torch.backends.cuda.matmul, torch.backends.cudnn
+    switches: tuple[Any, Any] = torch.backends.cuda.matmul, torch.backends.cudnn
     before = [switch.allow_tf32 for switch in switches]
     try:
         for switch in switches:

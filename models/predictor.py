@@ -6,6 +6,7 @@ its clouds is each network's own.
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from typing import ClassVar, Protocol
 
@@ -66,8 +67,9 @@ class Predictor(nn.Module, ABC):
 
     @property
     def device(self) -> torch.device:
-        """Where its weights are, and where its inputs must be."""
-        return next(self.parameters()).device
+        """Where its weights are, and where its inputs must be; the CPU for a network without weights."""
+        weights = next(itertools.chain(self.parameters(), self.buffers()), None)
+        return torch.device("cpu") if weights is None else weights.device
 
     @abstractmethod
     def forward(self, images: Tensor, codes: Tensor) -> Tensor:
