@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from diffpoint import check_pending
 from models import Autoencoder, Critic, Predictor
 from train.config import FitConfig, InferenceConfig, Recipe, StageConfig
 from train.data.batches import Targets
@@ -67,20 +68,19 @@ class Checks:
             self.settle()
 
     def settle(self) -> None:
-        """Waits until all conditions are known.
+        """Waits until all conditions are known, and the layer's of the values that it was given.
 
         Raises:
             UserError: one does not hold; the first.
+            ValueError: one of the layer's.
         """
-        if not self._open:
-            return
-        held = torch.stack([holds for holds, _ in self._open]).cpu().tolist()  # one copy from the GPU
-        complaints = [
-            complaint for (_, complaint), it_held in zip(self._open, held, strict=True) if not it_held
-        ]
-        self._open = []
-        if complaints:
-            raise UserError(complaints[0])
+        waiting, self._open = self._open, []
+        if waiting:
+            held = torch.stack([holds for holds, _ in waiting]).tolist()  # one copy from the GPU
+            for (_, complaint), it_held in zip(waiting, held, strict=True):
+                if not it_held:
+                    raise UserError(complaint)
+        check_pending()
 
 
 @dataclasses.dataclass(frozen=True)
