@@ -8,17 +8,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from diffpoint import _bridge, _checks
+from diffpoint import _auction, _bridge, _checks
 from diffpoint.distances import paired_sets
 from diffpoint.sampling import lanes
 
-# Limit on the bids of a pair, per point of its larger set; after it the remaining points are matched in order.
-_BIDS_PER_PERSON = 4000
 # The smallest bid increment, relative to the extent of the pair: the resolution of the prices' dtype.
-_RESOLUTION = {torch.float32: 2e-6, torch.float64: 1e-12}
-
-# Beyond this extent squares and prices overflow in float32, and prices exceed that of the padding in the kernel.
-_LARGEST_EXTENT = 1e18
+RESOLUTION = {torch.float32: 2e-6, torch.float64: 1e-12}
 
 
 class Transport(NamedTuple):
@@ -166,9 +161,7 @@ def _transport(
     enough: Tensor,
     tolerance: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    _checks.check_sets("earth_mover_distance", a, b, a_lengths, b_lengths, smallest=1)
-    for argument, values in (("start.prices", prices), ("start.cost", known_cost)):
-        _checks.check_finite("earth_mover_distance", argument, values)
+    extent = check_values(a, b, a_lengths, b_lengths, prices, known_cost)
     count, n, m = a.shape[0], a.shape[1], b.shape[1]
     bound = torch.zeros(count, dtype=torch.float64)
     finished = torch.ones(count, dtype=torch.uint8)
@@ -190,15 +183,6 @@ def _transport(
     objects = torch.where(swap[:, None, None], a_wide, b_wide)
     person_counts, object_counts = torch.minimum(a_lengths, b_lengths), torch.maximum(a_lengths, b_lengths)
 
-    extent = _extent(persons, person_counts, objects, object_counts)
-    if not bool((extent < _LARGEST_EXTENT).all()):
-        raise _checks.fail(
-            "earth_mover_distance",
-            "a",
-            "span less than 1e18 together with 'b'",
-            f"{extent.max():.3g}",
-            "Scale both down.",
-        )
     axes = lanes(objects)
     # Only differences between prices matter; without this they would grow from start to start.
     prices = prices - prices.amin(1, keepdim=True)
@@ -224,8 +208,8 @@ def _transport(
         bound,
         finished,
         float(tolerance),
-        _RESOLUTION[a.dtype],
-        _BIDS_PER_PERSON,
+        RESOLUTION[a.dtype],
+        _auction.BIDS_PER_PERSON,
     )
     # Indexed by the points of `a`; partners beyond the number of persons are dummy persons.
     partner = torch.where(swap[:, None], person_of, object_of)[:, :n].to(torch.int64)
@@ -240,16 +224,30 @@ def _transport(
     return cost, assignment, bound.to(a.dtype), finished.view(torch.bool), prices
 
 
-def _extent(persons: Tensor, person_counts: Tensor, objects: Tensor, object_counts: Tensor) -> Tensor:
+def check_values(
+    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, prices: Tensor, known_cost: Tensor
+) -> Tensor:
+    """Checks the values of the operator's arguments, on any device. Returns the extent (B,) of each pair."""
+    name = "earth_mover_distance"
+    _checks.check_sets(name, a, b, a_lengths, b_lengths, smallest=1)
+    for argument, values in (("start.prices", prices), ("start.cost", known_cost)):
+        _checks.check_finite(name, argument, values)
+    extent = _extent(a.detach(), a_lengths, b.detach(), b_lengths)
+    if not bool((extent < _auction.LARGEST_EXTENT).all()):
+        raise _checks.fail(
+            name, "a", "span less than 1e18 together with 'b'", f"{extent.max():.3g}", "Scale both down."
+        )
+    return extent
+
+
+def _extent(a: Tensor, a_lengths: Tensor, b: Tensor, b_lengths: Tensor) -> Tensor:
     """Diagonal of the bounding box of each pair; at least 1e-20, because bid increments are relative to it."""
     low, high = [], []
-    for cloud, counts in ((persons, person_counts), (objects, object_counts)):
-        padding = (torch.arange(cloud.shape[1]) >= counts[:, None])[..., None]
+    for cloud, counts in ((a, a_lengths), (b, b_lengths)):
+        padding = (torch.arange(cloud.shape[1], device=cloud.device) >= counts[:, None])[..., None]
         low.append(cloud.masked_fill(padding, torch.inf).amin(1))
         high.append(cloud.masked_fill(padding, -torch.inf).amax(1))
-    diagonal = (
-        (torch.maximum(*high) - torch.minimum(*low)).norm(dim=-1, dtype=torch.float64).to(persons.dtype)
-    )
+    diagonal = (torch.maximum(*high) - torch.minimum(*low)).norm(dim=-1, dtype=torch.float64).to(a.dtype)
     return diagonal.clamp(min=1e-20)
 
 

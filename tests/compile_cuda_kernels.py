@@ -1,6 +1,6 @@
 """Compiles kernels for CUDA without a GPU: python tests/compile_cuda_kernels.py LAUNCHES.json
 
-LAUNCHES.json holds a list of launches: module and name of the kernel, type or value of each argument, number of warps.
+LAUNCHES.json holds a list of launches: module and name of the kernel, type or value of each argument, and options.
 Triton brings the assembler, so that what it makes is machine code for the architectures below. In a process of its
 own, because the interpreter replaces the kernels in one where it is on.
 """
@@ -32,7 +32,7 @@ def main() -> None:
             compiled = compile_kernel(
                 ASTSource(kernel, signature=signature, constexprs=constants),
                 target=GPUTarget("cuda", architecture, 32),
-                options={"num_warps": launch["warps"], "enable_fp_fusion": False},
+                options=launch["options"],
             )
             print(launch["kernel"], architecture, len(compiled.asm["cubin"]), compiled.metadata.shared)
 

@@ -1,7 +1,5 @@
 """The kernels for CUDA tensors: on a GPU where there is one, else in Triton's interpreter; and compiled without one."""
 
-import json
-import os
 import re
 import subprocess
 import sys
@@ -13,67 +11,26 @@ import torch
 from test_operators import operator_arguments
 
 import diffpoint as dp
-from diffpoint import _bridge
-from diffpoint.testing import assert_close, cuda_kernels_interpreted
 
 pytest.importorskip("triton", reason="triton has no wheel here")
+from cuda_launches import DEVICE, ON_GPU, assert_same, compile_launches, on_cpu, recorded_launches
+
 from diffpoint.cuda import _MODULE_OF as kernels_of_operators
-from diffpoint.cuda import errors, launch
+from diffpoint.cuda import errors
 
 # The interpreter computes with numpy, which warns of infinities.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
-ON_GPU = torch.cuda.is_available()
-DEVICE = "cuda" if ON_GPU else "cpu"
 DTYPES = (torch.float32, torch.float64)
 LAUNCHES: dict[str, dict] = {}
 OPERATORS = operator_arguments()
-WITHOUT_KERNEL = {"approxmatch", "earth_mover_distance"}
+WITHOUT_KERNEL = {"approxmatch"}
 """Copied to the CPU and back."""
 
 
 @pytest.fixture(autouse=True)
 def cuda_kernels() -> Iterator[None]:
-    """Runs the kernels in the interpreter where there is no GPU, and remembers what was launched."""
-    if ON_GPU:
+    with recorded_launches(LAUNCHES):
         yield
-        return
-    launch.recorded = []
-    with cuda_kernels_interpreted():
-        yield
-    for kernel, arguments, warps in launch.recorded:
-        constants = [p == "constexpr" for p in annotations(kernel)]
-        described = {
-            "module": kernel.fn.__module__,
-            "kernel": kernel.fn.__name__,
-            "arguments": [
-                value if constant else launch.type_name(value)
-                for value, constant in zip(arguments, constants, strict=True)
-            ],
-            "warps": warps,
-        }
-        LAUNCHES[json.dumps(described)] = described
-    launch.recorded = None
-
-
-def annotations(kernel) -> list[str]:
-    names = kernel.fn.__code__.co_varnames[: kernel.fn.__code__.co_argcount]
-    return ["constexpr" if "constexpr" in str(kernel.fn.__annotations__.get(n, "")) else "" for n in names]
-
-
-def on_cpu(function, *arguments):
-    """The result of the CPU kernels, which have tests of their own."""
-    before, _bridge.interpreted = _bridge.interpreted, False
-    try:
-        return function(*arguments)
-    finally:
-        _bridge.interpreted = before
-
-
-def assert_same(function, *arguments) -> None:
-    """The kernels for CUDA give what those for the CPU give; sums up to rounding of their largest terms."""
-    for here, there in zip(function(*arguments), on_cpu(function, *arguments), strict=True):
-        finite = there.detach()[torch.isfinite(there)].double().abs()
-        assert_close(here, there, scale=max(1.0, float(finite.max())) if finite.numel() else 1.0)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -271,14 +228,4 @@ def test_the_cpu_never_imports_triton():
 # The last test: it compiles what the others have launched.
 @pytest.mark.skipif(ON_GPU, reason="they have been compiled to run")
 def test_kernels_compile_without_a_gpu(tmp_path):
-    assert LAUNCHES
-    file = tmp_path / "launches.json"
-    file.write_text(json.dumps(list(LAUNCHES.values())))
-    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
-    environment |= {"TRITON_CACHE_DIR": str(tmp_path / "cache"), "TRITON_DEFAULT_FP_FUSION": "0"}
-    root = Path(__file__).parents[1]
-    command = [sys.executable, str(root / "tests" / "compile_cuda_kernels.py"), str(file)]
-    environment["PYTHONPATH"] = str(root)
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stderr[-4000:]
-    assert len(done.stdout.splitlines()) == 2 * len(LAUNCHES)
+    compile_launches(LAUNCHES, tmp_path)

@@ -13,14 +13,19 @@ recorded: list[tuple[Any, tuple, int]] | None = None
 """If a list, it receives every launch: kernel, arguments, warps. For the test that compiles them without a GPU."""
 
 
-def launch(kernel: Any, programs: int, *arguments: Any, warps: int = 4) -> None:
+def launch(kernel: Any, programs: int, *arguments: Any, warps: int = 4, registers: int | None = None) -> None:
     """Runs `programs` programs of a kernel on the current stream, each with `warps` times 32 threads.
+
+    A thread gets at most `registers` registers: the fewer, the more programs share a multiprocessor.
 
     Products and sums are not fused: an edge between two pixels, or a tie, then falls as on the CPU.
     """
+    options: dict[str, Any] = {"num_warps": warps, "enable_fp_fusion": False}
+    if registers is not None:
+        options["maxnreg"] = registers
     if recorded is not None:
-        recorded.append((kernel, arguments, warps))
-    kernel[(programs,)](*arguments, num_warps=warps, enable_fp_fusion=False)
+        recorded.append((kernel, arguments, options))
+    kernel[(programs,)](*arguments, **options)
 
 
 def bits_of(value: float) -> int:

@@ -10,7 +10,7 @@ from torch import Tensor
 from diffpoint import _checks
 from diffpoint.cuda import errors
 from diffpoint.cuda.launch import launch
-from diffpoint.cuda.values import count_bad_points
+from diffpoint.cuda.values import count_bad_sets
 
 _QUERIES, _CANDIDATES = 64, 32  # of a tile
 
@@ -188,8 +188,5 @@ def _check(
     function: str, a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, *, smallest: int
 ) -> None:
     """The values of two batches of sets, as `_checks.check_sets`."""
-    for name, cloud, lengths in (("a", a, a_lengths), ("b", b, b_lengths)):
-        if cloud.shape[0] and cloud.shape[1] < smallest:
-            raise _checks.fail(function, name, "hold at least one point", str(tuple(cloud.shape)))
-        count_bad_points(function, name, cloud, lengths, smallest=smallest)
+    count_bad_sets(function, a, b, a_lengths, b_lengths, smallest=smallest)
     errors.settle(a, lambda: _checks.check_sets(function, a, b, a_lengths, b_lengths, smallest=smallest))

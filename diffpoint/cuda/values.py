@@ -6,6 +6,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from diffpoint import _checks
 from diffpoint.cuda import errors
 from diffpoint.cuda.launch import launch
 
@@ -38,3 +39,17 @@ def count_bad_points(function: str, name: str, points: Tensor, lengths: Tensor, 
     )
     blocks = max(1, triton.cdiv(size * 3, _BLOCK))
     launch(_count_bad, rows * blocks, points, lengths, not_finite, not_in_range, size, smallest, _BLOCK)
+
+
+def count_bad_sets(
+    function: str, a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, *, smallest: int
+) -> None:
+    """As `count_bad_points`, of two batches of sets (B, N, 3) and (B, M, 3).
+
+    Raises:
+        ValueError: the sets are padded to fewer than `smallest` points.
+    """
+    for name, cloud, lengths in (("a", a, a_lengths), ("b", b, b_lengths)):
+        if cloud.shape[0] and cloud.shape[1] < smallest:
+            raise _checks.fail(function, name, "hold at least one point", str(tuple(cloud.shape)))
+        count_bad_points(function, name, cloud, lengths, smallest=smallest)

@@ -11,14 +11,10 @@ so the cost is at most its difference from this bound above the optimum; the auc
 
 from types import SimpleNamespace
 
+from diffpoint._auction import COARSEST, ENOUGH, FAR, SCALING
 from diffpoint.kernels._backend import ti
 
 LANES = 16
-SCALING = 5.0  # epsilon's factor between phases
-COARSEST = 0.1  # first epsilon, relative to the extent of the pair
-ENOUGH = (
-    1.5  # smallest epsilon, relative to the accepted gap: a phase leaves a mean gap of 0.4 to 0.6 epsilon
-)
 
 
 def build(real):
@@ -32,7 +28,6 @@ def build(real):
     flags1 = ti.types.ndarray(dtype=ti.u8, ndim=1)
     clouds3 = ti.types.ndarray(dtype=real, ndim=3)
     indices2 = ti.types.ndarray(dtype=ti.i64, ndim=2)
-    far = 1.0e30  # price of padding
 
     @ti.func
     def two_cheapest(
@@ -47,8 +42,8 @@ def build(real):
         weight: real,
     ):
         """The cheapest object at distance times weight plus price, its total, and the total of the second."""
-        first = ti.Vector([real(far) for s in ti.static(range(LANES))])
-        second = ti.Vector([real(far) for s in ti.static(range(LANES))])
+        first = ti.Vector([real(FAR) for s in ti.static(range(LANES))])
+        second = ti.Vector([real(FAR) for s in ti.static(range(LANES))])
         first_tile = ti.Vector([0 for s in ti.static(range(LANES))])
         # The array's own size as the bound: with a computed one the loop is not vectorised (5x slower).
         for t in range(x_lanes.shape[1]):
@@ -109,13 +104,13 @@ def build(real):
                 n = ti.cast(person_counts[pair], ti.i32)
                 m = ti.cast(object_counts[pair], ti.i32)
                 for j in range(price.shape[1]):
-                    price[pair, j] = ti.select(j < m, price[pair, j], real(far))
+                    price[pair, j] = ti.select(j < m, price[pair, j], real(FAR))
                 smallest_epsilon = ti.cast(ti.cast(extent[pair], ti.f64) * resolution, real)
                 coarsest = ti.max(extent[pair] * real(COARSEST), smallest_epsilon)
                 epsilon = coarsest
                 proof_wanted = ti.cast(enough[pair], ti.f64) * n
                 proven = ti.cast(-1.0, ti.f64)
-                if start_cost[pair] >= 0 or enough[pair] < far:
+                if start_cost[pair] >= 0 or enough[pair] < FAR:
                     proven = 0.0
                     for i in range(m):
                         row = ti.min(i, n - 1)
