@@ -12,6 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffpoint import _auction
+
 FLOATS = (torch.float32, torch.float64)
 
 defer: Callable[[Tensor, str, str, str], bool] | None = None
@@ -177,6 +179,33 @@ def check_sets(
             raise fail(function, name, "hold at least one point", str(tuple(cloud.shape)))
         check_lengths_range(function, f"{name}_lengths", lengths, cloud.shape[1], smallest)
         check_finite(function, name, cloud, lengths)
+
+
+def check_transport(
+    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, prices: Tensor, known_cost: Tensor
+) -> Tensor:
+    """The values of the arguments of `earth_mover_distance`. Returns the extent (B,) of each pair."""
+    name = "earth_mover_distance"
+    check_sets(name, a, b, a_lengths, b_lengths, smallest=1)
+    for argument, values in (("start.prices", prices), ("start.cost", known_cost)):
+        check_finite(name, argument, values)
+    extent = _extent(a.detach(), a_lengths, b.detach(), b_lengths)
+    if not bool((extent < _auction.LARGEST_EXTENT).all()):
+        raise fail(
+            name, "a", "span less than 1e18 together with 'b'", f"{extent.max():.3g}", "Scale both down."
+        )
+    return extent
+
+
+def _extent(a: Tensor, a_lengths: Tensor, b: Tensor, b_lengths: Tensor) -> Tensor:
+    """Diagonal of the bounding box of each pair; at least 1e-20, because bid increments are relative to it."""
+    low, high = [], []
+    for cloud, counts in ((a, a_lengths), (b, b_lengths)):
+        padding = (torch.arange(cloud.shape[1], device=cloud.device) >= counts[:, None])[..., None]
+        low.append(cloud.masked_fill(padding, torch.inf).amin(1))
+        high.append(cloud.masked_fill(padding, -torch.inf).amax(1))
+    diagonal = (torch.maximum(*high) - torch.minimum(*low)).norm(dim=-1, dtype=torch.float64).to(a.dtype)
+    return diagonal.clamp(min=1e-20)
 
 
 def check_depth(function: str, name: str, depth: Tensor) -> None:
