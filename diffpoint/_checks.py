@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._C import _functorch
 
 FLOATS = (torch.float32, torch.float64)
 
@@ -24,15 +25,14 @@ def readable(*values: Tensor) -> bool:
     """Whether Python can read values of these: not while torch traces, nor where `torch.vmap` maps over them."""
     if torch.compiler.is_compiling():
         return False
-    return torch._C._functorch.maybe_current_level() is None or not any(_is_mapped(v) for v in values)
+    return _functorch.maybe_current_level() is None or not any(_is_mapped(v) for v in values)
 
 
 def _is_mapped(value: Tensor) -> bool:
-    functorch = torch._C._functorch
-    while functorch.is_functorch_wrapped_tensor(value):
-        if functorch.is_batchedtensor(value):
+    while _functorch.is_functorch_wrapped_tensor(value):
+        if _functorch.is_batchedtensor(value):
             return True
-        value = functorch.get_unwrapped(value)
+        value = _functorch.get_unwrapped(value)
     return False
 
 
@@ -40,7 +40,7 @@ def differentiated(*values: Tensor) -> bool:
     """Whether a gradient with respect to one of these may be asked for; in doubt, yes."""
     if not torch.is_grad_enabled():
         return False
-    transformed = torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None
+    transformed = torch.compiler.is_compiling() or _functorch.maybe_current_level() is not None
     return transformed or any(v.requires_grad for v in values)
 
 
