@@ -222,7 +222,7 @@ def _steps(stop: float) -> Iterator[dict[str, Any]]:
     """Training steps of the profiles, and where their time goes."""
     from benchmarks import training
 
-    for row in training.measure(device="cuda"):
+    for row in training.measure(device=torch.device("cuda", torch.cuda.current_device())):
         yield row
         if time.monotonic() > stop:
             return
@@ -230,7 +230,8 @@ def _steps(stop: float) -> Iterator[dict[str, Any]]:
 
 def _tests(stop: float) -> Iterator[dict[str, Any]]:
     """The layer's tests, on CUDA tensors where they are about these."""
-    command = [sys.executable, "-m", "pytest", "tests/test_cuda_kernels.py", "tests/test_operators.py", "-q"]
+    files = [f"tests/test_{name}.py" for name in ("cuda_kernels", "operators", "device")]
+    command = [sys.executable, "-m", "pytest", *files, "-q"]
     command += ["-p", "no:cacheprovider", "-W", "ignore::DeprecationWarning"]
     yield _run("tests", command, stop)
 

@@ -23,6 +23,8 @@ from diffpoint import losses, reference
 from models import PROFILES as SIZES
 from train.config import FitConfig, StageConfig
 from train.data.batches import LoadedSplit
+from train.device import CPU
+from train.distributed import connect
 from train.methods import losses as train_losses
 from train.methods import recipe
 from train.training.trainer import Trainer
@@ -36,20 +38,22 @@ _WITH_REFERENCE = (
 )  # with the full profile, the matrices of the reference would not fit the memory
 
 
-def measure(*, quick: bool = False) -> Iterator[dict[str, Any]]:
-    """A row for both stages of each profile."""
-    for profile in ("smoke", "cpu") if quick else ("smoke", "cpu", "full"):
+def measure(*, quick: bool = False, device: torch.device = CPU) -> Iterator[dict[str, Any]]:
+    """A row for both stages of each profile; on a GPU of those worth it, without the reference."""
+    on_cpu = device == CPU
+    profiles = ("smoke", "cpu") if quick else ("smoke", "cpu", "full") if on_cpu else ("cpu", "full")
+    for profile in profiles:
         config = recipe("ours", profile)
-        trainer = Trainer(config, _data(config))
+        trainer = Trainer(config, _data(config).to(device), connect(device))
         for name in ("stage1", "stage2"):
             trainer.enter_phase(name)
             stage = trainer.phase
             assert isinstance(stage, StageConfig)
-            warm, steps = _STEPS[profile]
+            warm, steps = _STEPS[profile] if on_cpu else (5, 15)
             # Where the diversity loss has its full weight, and the learning rate is small enough to change little.
             trainer.step = min(stage.ramp[1] + 1, stage.steps - 1)
             row = {"profile": profile, "stage": name[-1], **_shares(trainer, warm, 2 if quick else steps)}
-            if profile in _WITH_REFERENCE:
+            if profile in _WITH_REFERENCE and on_cpu:
                 with reference_ops():
                     row["reference_ratio"] = 1e3 * _seconds(trainer.train_step) / row["ms"]
                 if optimize := optional("scipy.optimize"):
@@ -69,15 +73,17 @@ def _shares(trainer: Trainer, warm: int, steps: int) -> dict[str, Any]:
     parts: dict[str, list[float]] = {}
     rendering: list[float] = []
 
-    original = losses.front_sets
+    original = losses._front_sets
 
-    def front_sets(*arguments: Any, **options: Any) -> Any:
-        start = time.perf_counter()
+    def _front_sets(*arguments: Any, **options: Any) -> Any:
+        start = _now()
         result = original(*arguments, **options)
-        rendering.append(time.perf_counter() - start)
+        rendering.append(_now() - start)
         return result
 
-    with _replaced(front_sets):
+    if trainer.device != CPU:  # looking into a step makes it wait for the GPU
+        plain = [1e3 * _seconds(trainer.train_step) for _ in range(steps)]
+    with _replaced(_front_sets):
         for _ in range(steps):
             rendering.clear()
             trainer.timer.reset()
@@ -90,16 +96,23 @@ def _shares(trainer: Trainer, warm: int, steps: int) -> dict[str, Any]:
     whole = sum(map(statistics.median, parts.values()))
     shares = {part: statistics.median(values) / whole for part, values in parts.items()}
     return {
-        "ms": statistics.median(milliseconds),
+        "ms": statistics.median(milliseconds if trainer.device == CPU else plain),
         "shares": shares,
         "layer_share": shares["splat and sample"] + shares["distances"],
     }
 
 
 def _seconds(function: Callable[[], Any]) -> float:
-    start = time.perf_counter()
+    start = _now()
     function()
-    return time.perf_counter() - start
+    return _now() - start
+
+
+def _now() -> float:
+    """Seconds, after what was given to a GPU."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return time.perf_counter()
 
 
 def _data(config: FitConfig) -> LoadedSplit:

@@ -9,3 +9,5 @@ BIDS_PER_PERSON = 4000
 # Beyond this extent squares and prices overflow in float32, and prices exceed that of the padding.
 LARGEST_EXTENT = 1e18
 FAR = 1e30  # price of padding
+# The smallest bid increment, relative to the extent of the pair: the resolution of prices of so many bytes.
+RESOLUTION = {4: 2e-6, 8: 1e-12}

@@ -12,10 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffpoint import _checks, _transforms
 from diffpoint._runtime import RUNTIME
 
 _REALS = {torch.float32: "f32", torch.float64: "f64"}
 _LARGEST = 2**31 - 1
+_NUMBER = torch.zeros(())  # on the CPU
 
 
 def launch(module: str, kernel: str, real: torch.dtype, *arguments: Tensor | int | float) -> None:
@@ -72,6 +74,7 @@ def register(
         op.register_fake(fake)
         if backward is not None:
             op.register_autograd(backward, setup_context=setup)
+        _transforms.support(op, name, backward, setup)
         return op
 
     return decorate
@@ -90,9 +93,11 @@ def _on_any_device(name: str, function: Callable, strided: bool) -> Callable:
                     results = kernel(*arguments)
                 if results is not NotImplemented:
                     return results
+        here = [a.cpu() if isinstance(a, Tensor) else a for a in arguments] if elsewhere else arguments
+        with _checks.full_precision(_NUMBER):
+            results = function(*here)
         if not elsewhere:
-            return function(*arguments)
-        results = function(*(a.cpu() if isinstance(a, Tensor) else a for a in arguments))
+            return results
         if isinstance(results, Tensor):
             return results.to(elsewhere[0])
         return tuple(r.to(elsewhere[0]) for r in results)

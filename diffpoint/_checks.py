@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import numbers
+import operator
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from diffpoint import _auction
 
 FLOATS = (torch.float32, torch.float64)
 
@@ -21,16 +26,59 @@ def fail(function: str, argument: str, expected: str, got: str, hint: str = "") 
     return ValueError(f"{function}: '{argument}' must {expected}; got {got}." + (f" {hint}" if hint else ""))
 
 
+def readable(*values: Tensor) -> bool:
+    """Whether Python can read values of these: not while torch traces, nor where `torch.vmap` maps over them."""
+    if torch.compiler.is_compiling():
+        return False
+    return torch._C._functorch.maybe_current_level() is None or not any(_is_mapped(v) for v in values)
+
+
+def _is_mapped(value: Tensor) -> bool:
+    functorch = torch._C._functorch
+    while functorch.is_functorch_wrapped_tensor(value):
+        if functorch.is_batchedtensor(value):
+            return True
+        value = functorch.get_unwrapped(value)
+    return False
+
+
+def differentiated(*values: Tensor) -> bool:
+    """Whether a gradient with respect to one of these may be asked for; in doubt, yes."""
+    if not torch.is_grad_enabled():
+        return False
+    transformed = torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None
+    return transformed or any(v.requires_grad for v in values)
+
+
+def full_precision(like: Tensor) -> contextlib.AbstractContextManager:
+    """Matrices are multiplied in their own dtype inside, whatever `torch.autocast` says."""
+    device = like.device.type
+    if torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device):
+        return torch.autocast(device, enabled=False)
+    return contextlib.nullcontext()
+
+
 def check_tensor(function: str, name: str, value: Any, shape: tuple[int | str, ...]) -> Tensor:
     """Type, dtype and shape of a float tensor. A string in `shape` is a free size; "*" any leading sizes."""
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{function}: '{name}' must be a torch.Tensor; got {type(value).__name__}.")
+        raise TypeError(f"{function}: '{name}' must be a torch.Tensor; got {_kind(value)}")
+    if value.is_nested or value.layout is not torch.strided:
+        kind = "nested" if value.is_nested else f"{value.layout}"
+        raise TypeError(
+            f"{function}: '{name}' must be a dense tensor; got a {kind} one. Pad it, or use .to_dense()."
+        )
     if value.dtype not in FLOATS:
         raise TypeError(
             f"{function}: '{name}' must be float32 or float64; got {value.dtype}. Convert it with .float()."
         )
     check_shape(function, name, value, shape)
     return value
+
+
+def _kind(value: Any) -> str:
+    """What a value that is no tensor is, as the end of a message."""
+    hint = " Convert it with torch.from_numpy." if type(value).__name__ == "ndarray" else ""
+    return f"{type(value).__name__}.{hint}"
 
 
 def check_device(function: str, name: str, value: Tensor, like: Tensor) -> None:
@@ -50,7 +98,9 @@ def check_shape(
     sizes = value.shape[value.dim() - len(free) :] if leading_ok else ()
     if not leading_ok or any(isinstance(s, int) and s != n for s, n in zip(free, sizes, strict=True)):
         wanted = "(" + ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
-        if not hint and value.dim() == len(shape) - 1:
+        if not hint and value.dim() and isinstance(free[-1], int) and value.shape[-1] != free[-1]:
+            hint = f"The last size must be {free[-1]}, not {value.shape[-1]}."
+        elif not hint and value.dim() == len(free) - 1:
             hint = "Did you forget to batch? Add the leading dimension with [None]."
         raise fail(function, name, f"have shape {wanted}", str(tuple(value.shape)), hint)
 
@@ -74,8 +124,8 @@ def check_lengths(
     if lengths is None:
         return None
     if not isinstance(lengths, torch.Tensor) or lengths.dtype not in (torch.int64, torch.int32):
-        what = lengths.dtype if isinstance(lengths, torch.Tensor) else type(lengths).__name__
-        raise TypeError(f"{function}: '{name}' must be an integer tensor (int64); got {what}.")
+        what = f"{lengths.dtype}." if isinstance(lengths, torch.Tensor) else _kind(lengths)
+        raise TypeError(f"{function}: '{name}' must be an integer tensor (int64); got {what}")
     if like is not None:
         check_device(function, name, lengths, like)
     if tuple(lengths.shape) != tuple(shape):
@@ -96,8 +146,13 @@ def check_lengths_range(function: str, name: str, lengths: Tensor, largest: int,
 
 
 def check_finite(function: str, name: str, value: Tensor, lengths: Tensor | None = None) -> None:
-    """No NaN or infinity among the first `lengths` points. A finite sum is enough; only else are all values read."""
-    if value.numel() == 0 or (not value.is_cuda and math.isfinite(float(value.sum()))):
+    """No NaN or infinity among the first `lengths` points. A finite sum is enough; only else are all values read.
+
+    Not where `value` is not `readable`.
+    """
+    if value.numel() == 0 or not readable(value):
+        return
+    if not value.is_cuda and math.isfinite(float(value.sum())):
         return
     bad = ~torch.isfinite(value)
     if lengths is not None:
@@ -120,15 +175,46 @@ def check_sets(
 ) -> None:
     """The values of two batches of sets: lengths in range, and finite coordinates."""
     for name, cloud, lengths in (("a", a, a_lengths), ("b", b, b_lengths)):
-        if cloud.shape[1] < smallest:
+        if cloud.shape[1] < smallest and cloud.shape[0]:  # a batch of no sets has no empty one
             raise fail(function, name, "hold at least one point", str(tuple(cloud.shape)))
         check_lengths_range(function, f"{name}_lengths", lengths, cloud.shape[1], smallest)
         check_finite(function, name, cloud, lengths)
 
 
+def check_transport(
+    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, prices: Tensor, known_cost: Tensor
+) -> Tensor:
+    """The values of the arguments of `earth_mover_distance`. Returns the extent (B,) of each pair."""
+    name = "earth_mover_distance"
+    check_sets(name, a, b, a_lengths, b_lengths, smallest=1)
+    for argument, values in (("start.prices", prices), ("start.cost", known_cost)):
+        check_finite(name, argument, values)
+    extent = _extent(a.detach(), a_lengths, b.detach(), b_lengths)
+    if not bool((extent < _auction.LARGEST_EXTENT).all()):
+        raise fail(
+            name, "a", "span less than 1e18 together with 'b'", f"{extent.max():.3g}", "Scale both down."
+        )
+    return extent
+
+
+def _extent(a: Tensor, a_lengths: Tensor, b: Tensor, b_lengths: Tensor) -> Tensor:
+    """Diagonal of the bounding box of each pair; at least 1e-20, because bid increments are relative to it."""
+    low, high = [], []
+    for cloud, counts in ((a, a_lengths), (b, b_lengths)):
+        padding = (torch.arange(cloud.shape[1], device=cloud.device) >= counts[:, None])[..., None]
+        low.append(cloud.masked_fill(padding, torch.inf).amin(1))
+        high.append(cloud.masked_fill(padding, -torch.inf).amax(1))
+    diagonal = (torch.maximum(*high) - torch.minimum(*low)).norm(dim=-1, dtype=torch.float64).to(a.dtype)
+    return diagonal.clamp(min=1e-20)
+
+
 def check_depth(function: str, name: str, depth: Tensor) -> None:
-    """Depth maps hold positive numbers, and +inf where they are empty."""
+    """Depth maps hold positive numbers, and +inf where they are empty. Not checked where they are not `readable`."""
+    if not readable(depth):
+        return
     good = depth > 0
+    if depth.is_cuda and defer is not None and defer(~good, function, name, "depth"):
+        return
     if not bool(good.all()):
         where = tuple((~good).nonzero()[0].tolist())
         raise fail(
@@ -157,6 +243,36 @@ def check_picks(lengths: Tensor, size: int, k: int, start: int) -> None:
 def check_clouds(function: str, name: str, value: Any) -> Tensor:
     """A batch of clouds (B, N, 3)."""
     return check_tensor(function, name, value, ("B", "N", 3))
+
+
+def check_number(
+    function: str, name: str, value: Any, expected: str, fits: Callable[[float], bool], hint: str = ""
+) -> float:
+    """A number of Python or numpy, of which `fits` is true; `expected` says it in words."""
+    if isinstance(value, Tensor):
+        hint = hint or f"Pass a number, for instance {name}.item()."
+        raise TypeError(
+            f"{function}: '{name}' must be a Python or numpy number; got a torch.Tensor, which would get no gradient. "
+            + hint
+        )
+    if isinstance(value, bool) or not isinstance(value, (numbers.Real, torch.SymFloat, torch.SymInt)):
+        raise TypeError(
+            f"{function}: '{name}' must be a Python or numpy number; got {value!r} ({type(value).__name__})."
+        )
+    if not fits(float(value)):
+        raise fail(function, name, expected, repr(value))
+    return float(value)
+
+
+def check_integer(function: str, name: str, value: Any, expected: str, smallest: int) -> int:
+    """A whole number of Python or numpy, at least `smallest`; `expected` says it in words."""
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < smallest:
+        raise fail(function, name, expected, repr(value))
+    return number
 
 
 def check_choice(function: str, name: str, value: str, choices: tuple[str, ...]) -> None:

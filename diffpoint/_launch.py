@@ -12,6 +12,8 @@ from typing import Any
 
 from torch import Tensor
 
+from diffpoint._backend import without_warnings
+
 # What a missing attribute or a changed signature raises, before anything has run. An error of the kernel itself is a
 # RuntimeError and is not caught: a kernel that adds to its outputs must not run twice.
 _INCOMPATIBLE = (AttributeError, IndexError, KeyError, TypeError)
@@ -53,10 +55,11 @@ class FastCall:
         if program is self.program and self._try(self._run, arguments):
             return
         detached = [a.detach() if isinstance(a, Tensor) else a for a in arguments]
-        self.kernel(*detached)
-        self.program = None
-        if self.compatible and self._try(self._prepare, program, detached):
-            self.program = program
+        with without_warnings():
+            self.kernel(*detached)
+            self.program = None
+            if self.compatible and self._try(self._prepare, program, detached):
+                self.program = program
 
     def _try(self, step: Callable[..., bool], *arguments: Any) -> bool:
         try:

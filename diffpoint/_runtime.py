@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import importlib
 import inspect
 import io
+import math
 import os
 import platform
 import sys
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any, Literal, get_args
 
-from diffpoint._backend import BACKENDS, backend_name, import_backend
+from diffpoint import _checks
+from diffpoint._backend import BACKENDS, backend_name, home_directory, import_backend, without_warnings
 from diffpoint._launch import FastCall
 
 Checks = Literal["deferred", "immediate", "off"]
@@ -40,7 +44,7 @@ class RuntimeInfo:
     """Who started Taichi: "diffpoint", "host" or "nobody"."""
     threads: int
     cache: bool
-    """Whether compiled kernels are cached on disk for later processes."""
+    """Whether compiled kernels are cached on disk for later processes; False also where there is no place for them."""
     processor: str
     """Name of the processor, if the system reports it, to label measured times with."""
 
@@ -81,7 +85,12 @@ class _Runtime:
 
     def _start(self) -> Any:
         ti = import_backend()
-        with contextlib.redirect_stdout(io.StringIO()):  # init prints its version
+        with (
+            contextlib.redirect_stdout(io.StringIO()),  # init prints its version
+            home_directory() as lasting,
+            without_warnings(),
+        ):
+            self.cache = self.cache and lasting and _has_cache_folder(ti)
             ti.init(
                 arch=ti.cpu,
                 log_level=ti.ERROR,
@@ -95,14 +104,28 @@ class _Runtime:
         self.program = self.current_program()
         return self.program
 
+    def release(self) -> None:
+        """Let go of the program at the end of the process: Taichi writes its cache when nothing refers to it any more.
+
+        Not where it has no folder: it would crash, even with its cache turned off. Nor in a forked child, where it
+        would wait for its threads, which are missing.
+        """
+        with self.lock:
+            if self.program is None or not self.cache or self.forked:
+                return
+            if _has_cache_folder(import_backend()):
+                self.calls.clear()
+                self.kernels.clear()
+                self.program = None
+
     def kernel(self, module: str, real: str) -> SimpleNamespace:
         """The kernels of `diffpoint.kernels.<module>` for "f32" or "f64"."""
         key = (module, real)
         if key not in self.kernels:
             ti = import_backend()
-            self.kernels[key] = importlib.import_module(f"diffpoint.kernels.{module}").build(
-                getattr(ti, real)
-            )
+            with without_warnings():
+                build = importlib.import_module(f"diffpoint.kernels.{module}").build
+                self.kernels[key] = build(getattr(ti, real))
         return self.kernels[key]
 
     def call(self, module: str, kernel: str, real: str) -> FastCall:
@@ -117,11 +140,58 @@ class _Runtime:
         return list(inspect.signature(getattr(self.kernel(module, "f32"), kernel)).parameters)[position]
 
 
-def available_threads() -> int:
-    """Number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def _has_cache_folder(ti: ModuleType) -> bool:
+    """Whether the folder for compiled kernels exists or can be made.
+
+    One that exists may be read-only: its kernels are used, and none are added.
+    """
+    prefix = {"taichi": "TI", "quadrants": "QD"}[ti.__name__]
+    folder = os.environ.get(f"{prefix}_OFFLINE_CACHE_FILE_PATH")
+    folder = folder or ti.lang.impl.default_cfg().offline_cache_file_path
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError:
+        return False
+    return True
+
+
+def available_threads(
+    groups: Path = Path("/sys/fs/cgroup"), membership: Path = Path("/proc/self/cgroup")
+) -> int:
+    """Number of cores that this process may use: of those it may run on, as many as its CPU quota pays for.
+
+    Args:
+        groups: where the control groups of the system are; containers get their quotas through them.
+        membership: lists the groups of this process.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min([cores, *(math.ceil(quota) for quota in _cpu_quotas(groups, membership))]))
+
+
+def _cpu_quotas(groups: Path, membership: Path) -> Iterator[float]:
+    """Seconds of CPU time per second that the control groups of this process allow, in both versions of these."""
+    for line in _read(membership).splitlines():
+        _, controllers, path = [*line.split(":", 2), "", ""][:3]
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        roots = [groups, groups / "unified"] if not controllers else [groups / "cpu", groups / controllers]
+        # A limit of a group holds for those below it. In a container the path may be that of the host, of which only
+        # the last part, or nothing, is mounted.
+        folders = [Path(path.lstrip("/")), *Path(path.lstrip("/")).parents]
+        for folder in (root / folder for root in roots for folder in folders):
+            quota, _, period = _read(folder / "cpu.max").strip().partition(" ")
+            if controllers:
+                quota, period = (_read(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period"))
+            if quota.isdecimal() and period.isdecimal() and int(quota) and int(period):  # else "max" or -1
+                yield int(quota) / int(period)
+
+
+def _read(file: Path) -> str:
+    """Its text; nothing if it cannot be read."""
+    try:
+        return file.read_text()
+    except OSError:
+        return ""
 
 
 RUNTIME = _Runtime()
@@ -133,6 +203,7 @@ def _mark_forked() -> None:
     RUNTIME.lock = threading.RLock()  # another thread of the parent may have held the old one
 
 
+atexit.register(RUNTIME.release)
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_mark_forked)
 
@@ -141,7 +212,8 @@ def configure(*, threads: int | None = None, cache: bool | None = None, checks: 
     """Set how the kernels run; call it before the first op. Only `checks` may be changed later.
 
     Args:
-        threads: number of threads of the CPU kernels; None means every core that this process may use.
+        threads: number of threads of the CPU kernels; None means every core that this process may use, CPU quotas of
+            containers included.
         cache: cache compiled CPU kernels on disk, so that the next process starts in a fraction of a second; None means
             yes.
         checks: when values of CUDA tensors that are not allowed (NaN, a length out of range) become errors. "deferred",
@@ -159,12 +231,10 @@ def configure(*, threads: int | None = None, cache: bool | None = None, checks: 
         >>> subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip()
         '1'
     """
-    if threads is not None and (not isinstance(threads, int) or isinstance(threads, bool) or threads < 1):
-        raise ValueError(f"configure: 'threads' must be a positive integer or None; got {threads!r}.")
-    if checks is not None and checks not in get_args(Checks):
-        raise ValueError(
-            f"configure: 'checks' must be 'deferred', 'immediate', 'off' or None; got {checks!r}."
-        )
+    if threads is not None:
+        threads = _checks.check_integer("configure", "threads", threads, "be a positive integer or None", 1)
+    if checks is not None:
+        _checks.check_choice("configure", "checks", checks, get_args(Checks))
     with RUNTIME.lock:
         if checks is not None:
             RUNTIME.checks = checks

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import NamedTuple
 
 import torch
@@ -52,9 +53,11 @@ class PinholeCamera:
         _checks.check_tensor("PinholeCamera", "cam_from_world", self.cam_from_world, ("*", 4, 4))
         _checks.check_same_dtype("PinholeCamera", K=self.K, cam_from_world=self.cam_from_world)
         for name in ("height", "width"):
-            size = getattr(self, name)
-            if not isinstance(size, int) or isinstance(size, bool) or size < 1:
-                raise _checks.fail("PinholeCamera", name, "be a positive integer", repr(size))
+            size = _checks.check_integer(
+                "PinholeCamera", name, getattr(self, name), "be a positive integer", 1
+            )
+            if size is not getattr(self, name):  # a number of numpy
+                object.__setattr__(self, name, size)
         try:
             torch.broadcast_shapes(self.K.shape[:-2], self.cam_from_world.shape[:-2])
         except RuntimeError:
@@ -64,12 +67,13 @@ class PinholeCamera:
                 f"have leading dimensions that fit those of 'K' {tuple(self.K.shape[:-2])}",
                 str(tuple(self.cam_from_world.shape[:-2])),
             ) from None
-        if not torch.compiler.is_compiling():
-            self._check_last_rows()
+        self._check_last_rows()
 
     def _check_last_rows(self) -> None:
         for name, value in (("K", self.K), ("cam_from_world", self.cam_from_world)):
             value = value.detach()
+            if not _checks.readable(value):
+                continue
             _checks.check_finite("PinholeCamera", name, value)
             row = value[..., -1, :]
             wanted = _last_row(row.shape[-1], value.dtype, value.device)
@@ -95,13 +99,23 @@ class PinholeCamera:
             >>> PinholeCamera.look_at((2.0, 0, 0), focal_px=100.0, height=8, width=8).cam_from_world[2].tolist()
             [-1.0, 0.0, 0.0, 2.0]
         """
+        focal_px = _checks.check_number(
+            "PinholeCamera.look_at",
+            "focal_px",
+            focal_px,
+            "be finite and not 0",
+            lambda f: math.isfinite(f) and f != 0,
+            "To differentiate with respect to a focal length, make the matrix yourself: PinholeCamera(K, ...).",
+        )
         at = _vector("eye", eye)
         at, towards, upward = torch.broadcast_tensors(
             at, _vector("target", target, at), _vector("up", up, at)
         )
         forward = towards - at
         right = torch.linalg.cross(forward, upward)
-        if bool((forward.norm(dim=-1) == 0).any()) or bool((right.norm(dim=-1) < 1e-9).any()):
+        if _checks.readable(forward, right) and (
+            bool((forward.norm(dim=-1) == 0).any()) or bool((right.norm(dim=-1) < 1e-9).any())
+        ):
             raise _checks.fail(
                 "PinholeCamera.look_at",
                 "up",
@@ -115,7 +129,8 @@ class PinholeCamera:
         rotation = torch.stack((right, down, forward), dim=-2)
         cam_from_world = at.new_zeros((*at.shape[:-1], 4, 4))
         cam_from_world[..., :3, :3] = rotation
-        cam_from_world[..., :3, 3] = -(rotation @ at[..., None])[..., 0]
+        with _checks.full_precision(at):
+            cam_from_world[..., :3, 3] = -(rotation @ at[..., None])[..., 0]
         cam_from_world[..., 3, 3] = 1
         K = at.new_tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]]).expand(
             *at.shape[:-1], 3, 3
@@ -131,7 +146,10 @@ class PinholeCamera:
             >>> PinholeCamera.from_opengl(torch.eye(3), gl, 4, 4).position.tolist()
             [0.0, 0.0, 2.0]
         """
-        return cls(K, cam_from_world.new_tensor(_FLIP_YZ) @ cam_from_world, height, width)
+        _checks.check_tensor("PinholeCamera.from_opengl", "cam_from_world", cam_from_world, ("*", 4, 4))
+        with _checks.full_precision(cam_from_world):
+            flipped = cam_from_world.new_tensor(_FLIP_YZ) @ cam_from_world
+        return cls(K, flipped, height, width)
 
     @classmethod
     def from_pytorch3d(cls, R: Tensor, T: Tensor, K: Tensor, height: int, width: int) -> PinholeCamera:
@@ -144,11 +162,15 @@ class PinholeCamera:
             >>> PinholeCamera.from_pytorch3d(R, T, K, 4, 4).position.tolist()
             [0.0, 0.0, -2.0]
         """
+        _checks.check_tensor("PinholeCamera.from_pytorch3d", "R", R, ("*", 3, 3))
+        _checks.check_tensor("PinholeCamera.from_pytorch3d", "T", T, ("*", 3))
         view_from_world = R.new_zeros((*R.shape[:-2], 4, 4))
         view_from_world[..., :3, :3] = R.transpose(-1, -2)
         view_from_world[..., :3, 3] = T
         view_from_world[..., 3, 3] = 1
-        return cls(K, R.new_tensor(_FLIP_XY) @ view_from_world, height, width)
+        with _checks.full_precision(R):
+            flipped = R.new_tensor(_FLIP_XY) @ view_from_world
+        return cls(K, flipped, height, width)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -170,13 +192,15 @@ class PinholeCamera:
     @property
     def projection(self) -> Tensor:
         """(..., 3, 4): (u d, v d, d) = projection @ (x, y, z, 1), with depth d, for world points."""
-        return self.K @ self.cam_from_world[..., :3, :]
+        with _checks.full_precision(self.K):
+            return self.K @ self.cam_from_world[..., :3, :]
 
     @property
     def back_projection(self) -> Tensor:
         """(..., 3, 4): world point = d * (M[:, :3] @ (u, v, 1)) + M[:, 3] for the pixel position (u, v) at depth d."""
         world_from_cam = _inverse("cam_from_world", self.cam_from_world)
-        rays = world_from_cam[..., :3, :3] @ _inverse("K", self.K)
+        with _checks.full_precision(self.K):
+            rays = world_from_cam[..., :3, :3] @ _inverse("K", self.K)
         origin = world_from_cam[..., :3, 3:].expand(*rays.shape[:-1], 1)
         return torch.cat((rays, origin), dim=-1)
 
@@ -200,7 +224,13 @@ class PinholeCamera:
         )
 
     def __getitem__(self, item) -> PinholeCamera:
-        """Index the leading dimensions."""
+        """Index the leading dimensions; `camera[:, None]` makes one view for each cloud of N cameras.
+
+        Example:
+            >>> cameras = PinholeCamera(torch.eye(3), torch.eye(4).expand(5, 4, 4), 8, 8)
+            >>> cameras[2].batch_shape, cameras[1:].batch_shape, cameras[:, None].batch_shape
+            ((), (4,), (5, 1))
+        """
         shape = self.batch_shape
         if not shape:
             raise IndexError("PinholeCamera: a single camera has no leading dimension to index.")
@@ -217,7 +247,7 @@ def _last_row(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 def _inverse(name: str, matrix: Tensor) -> Tensor:
     inverse, singular = torch.linalg.inv_ex(matrix)
-    if not torch.compiler.is_compiling() and bool(singular.any()):
+    if _checks.readable(singular) and bool(singular.any()):
         got = matrix.detach()[singular > 0][0].tolist() if matrix.dim() > 2 else matrix.tolist()
         raise _checks.fail("PinholeCamera", name, "be invertible", str(got), "Is a focal length 0?")
     return inverse
@@ -273,7 +303,12 @@ def check_views(
         )
     own = shape[-1] if shape else 1
     if views is not None and own not in (1, views):
-        raise _checks.fail(function, name, f"have {views} views to match 'depth'", str(own))
+        hint = (
+            f"For one camera for each of the {batch} clouds pass {name}[:, None]."
+            if shape == (batch,)
+            else ""
+        )
+        raise _checks.fail(function, name, f"have {views} views to match 'depth'", str(own), hint)
     return Views(camera, (batch, own if views is None else views))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from types import ModuleType
@@ -22,6 +23,7 @@ def encode_depth(depth: Tensor, *, max_depth: float = 10.0) -> np.ndarray:
         >>> encode_depth(torch.tensor([2.0, float("inf")])).tolist()
         [13107, 65535]
     """
+    max_depth = _check_max_depth("encode_depth", max_depth)
     code = (depth.detach().double() * (_EMPTY / max_depth)).round().clamp(0, _EMPTY - 1)
     return torch.where(torch.isfinite(depth), code, _EMPTY).numpy().astype(np.uint16)
 
@@ -33,6 +35,7 @@ def decode_depth(code: np.ndarray, *, max_depth: float = 10.0) -> Tensor:
         >>> decode_depth(np.array([13107, 65535], np.uint16)).tolist()
         [2.0, inf]
     """
+    max_depth = _check_max_depth("decode_depth", max_depth)
     depth = code.astype(np.float64) * (max_depth / _EMPTY)
     return torch.from_numpy(np.where(code == _EMPTY, np.inf, depth).astype(np.float32))
 
@@ -47,6 +50,7 @@ def write_depth(path: str | os.PathLike[str], depth: Tensor, *, max_depth: float
     Source: the released data of the CVPR 2019 paper (max_depth 10).
     """
     _checks.check_tensor("write_depth", "depth", depth, ("H", "W"))
+    max_depth = _check_max_depth("write_depth", max_depth)
     encodable = ((depth >= 0) & (depth < max_depth)) | torch.isposinf(depth)
     if not bool(encodable.all()):
         where = tuple((~encodable).nonzero()[0].tolist())
@@ -67,6 +71,12 @@ def read_depth(path: str | os.PathLike[str], *, max_depth: float = 10.0) -> Tens
         got = f"{code.dtype} {code.shape}"
         raise _checks.fail("read_depth", "path", "name a 16-bit image with one channel", f"{path}: {got}")
     return decode_depth(code, max_depth=max_depth)
+
+
+def _check_max_depth(function: str, max_depth: float) -> float:
+    return _checks.check_number(
+        function, "max_depth", max_depth, "be positive and finite", lambda x: 0 < x < math.inf
+    )
 
 
 def write_points(path: str | os.PathLike[str], points: Tensor) -> None:

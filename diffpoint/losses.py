@@ -64,19 +64,45 @@ def front_sets(
         >>> sets.predicted_lengths.tolist(), sets.observed_lengths.tolist()
         ([[1]], [[1]])
     """
+    return _front_sets(points, camera, depth, visibility)[0]
+
+
+class _Counts(NamedTuple):
+    """What is read of `FrontSets`, in one transfer, because each would wait for a GPU."""
+
+    fallback: bool
+    """Whether a view sees no predicted point."""
+    fewest: int
+    """Points of the depth map that has the fewest."""
+    most: int
+    """Points of the depth map that has the most."""
+
+
+def _front_sets(
+    points: Tensor, camera: PinholeCamera, depth: Tensor, visibility: Method
+) -> tuple[FrontSets, _Counts | None]:
+    """The sets, and what is known of their sizes; None where sizes must not depend on values (see `readable`)."""
     batch, views = check_maps("front_sets", points, camera, depth)
     sample = sample_view(points, visible_points(points, camera, method=visibility))
     seen = sample.points.expand(batch, views, -1, 3)
     lengths = sample.lengths.expand(batch, views)
     fallback = lengths == 0
-    if bool(fallback.any()):
+    observed, observed_lengths = unproject(depth, camera)
+    counts = None
+    if not fallback.numel():
+        counts = _Counts(False, 0, 0)
+    elif _checks.readable(points, depth, lengths):
+        numbers = fallback.any().long(), *observed_lengths.aminmax()
+        some_fallback, fewest, most = torch.stack(numbers).tolist()
+        counts = _Counts(bool(some_fallback), fewest, most)
+    if counts is None or counts.fallback:
         extra = points.shape[1] - seen.shape[2]
         seen = torch.nn.functional.pad(seen, (0, 0, 0, extra))
         seen = torch.where(fallback[..., None, None], points[:, None], seen)
         lengths = torch.where(fallback, points.shape[1], lengths)
-    observed, observed_lengths = unproject(depth, camera)
-    longest = int(observed_lengths.max()) if observed_lengths.numel() else 0
-    return FrontSets(seen, lengths, observed[:, :, :longest], observed_lengths, fallback)
+    if counts is not None:
+        observed = observed[:, :, : counts.most]
+    return FrontSets(seen, lengths, observed, observed_lengths, fallback), counts
 
 
 class FrontTerms(NamedTuple):
@@ -126,7 +152,7 @@ def front_terms(
         >>> terms.matched.tolist(), terms.observed.tolist(), terms.loss[0, 1].item()
         ([[1, 0]], [[1, 0]], 0.0)
     """
-    return _front_terms("front_terms", points, camera, depth, distance, tolerance, visibility)
+    return _front_terms("front_terms", points, camera, depth, distance, tolerance, visibility)[0]
 
 
 def _front_terms(
@@ -137,26 +163,26 @@ def _front_terms(
     distance: Distance,
     tolerance: float,
     visibility: Method,
-) -> FrontTerms:
+) -> tuple[FrontTerms, _Counts | None]:
     _checks.check_choice(function, "distance", distance, ("chamfer", "emd"))
-    sets = front_sets(points, camera, depth, visibility=visibility)
-    if points.shape[1] == 0:
+    sets, counts = _front_sets(points, camera, depth, visibility)
+    if points.shape[1] == 0 and points.shape[0]:
         raise _checks.fail(function, "points", "hold at least one point", str(tuple(points.shape)))
     kept = sets.observed_lengths > 0
-    if not bool(kept.any()):
+    if counts is None:
+        # One point stands for each empty map; its loss is not used.
+        compared = sets._replace(observed_lengths=sets.observed_lengths.clamp(min=1))
+        loss = torch.where(kept, _compare_sets(compared, distance, tolerance), 0.0)
+    elif not counts.most:
         # Depends on `points`, so that the backward pass of such a batch gives zeros and does not fail.
         loss = points.new_zeros(kept.shape) + (0 * points).sum()
-    elif bool(kept.all()):
+    elif counts.fewest:
         loss = _compare_sets(sets, distance, tolerance)
     else:
         compared = _compare_sets(FrontSets(*(value[kept] for value in sets)), distance, tolerance)
         loss = points.new_zeros(kept.shape).masked_scatter(kept, compared)
-    return FrontTerms(
-        loss,
-        sets.predicted_lengths.minimum(sets.observed_lengths),
-        sets.observed_lengths,
-        sets.fallback & kept,
-    )
+    matched = sets.predicted_lengths.minimum(sets.observed_lengths)
+    return FrontTerms(loss, matched, sets.observed_lengths, sets.fallback & kept), counts
 
 
 def _compare_sets(sets: FrontSets, distance: Distance, tolerance: float) -> Tensor:
@@ -192,8 +218,8 @@ def front_constraint(
 
     Returns:
         The loss in world units. A view whose depth map is empty has loss 0. In a view in which no predicted point is
-        visible the whole cloud is compared, which pulls it into view. Both raise a `RuntimeWarning`; `front_terms`
-        returns them instead.
+        visible the whole cloud is compared, which pulls it into view. Both raise a `RuntimeWarning`, except under
+        `torch.compile` and `torch.vmap`, which do not let it read values; `front_terms` returns them instead.
 
     Gradients: to x, y and z of the visible points; none through the choice of the points.
 
@@ -212,12 +238,12 @@ def front_constraint(
         >>> same < shifted  # not 0: the points of a pixel are compared with its centre
         True
     """
-    terms = _front_terms("front_constraint", points, camera, depth, distance, tolerance, visibility)
-    for happened, what in (
-        (terms.fallback, "no predicted point is visible"),
-        (terms.observed == 0, "the depth map is empty"),
+    terms, counts = _front_terms("front_constraint", points, camera, depth, distance, tolerance, visibility)
+    for possible, happened, what in (
+        (counts is not None and counts.fallback, terms.fallback, "no predicted point is visible"),
+        (counts is not None and not counts.fewest, terms.observed == 0, "the depth map is empty"),
     ):
-        if bool(happened.any()):
+        if possible and bool(happened.any()):
             where = tuple(happened.nonzero()[0].tolist())
             warnings.warn(
                 f"front_constraint: in {int(happened.sum())} of {happened.numel()} views {what}; "
@@ -257,10 +283,8 @@ def diversity_loss(
     _checks.check_tensor("diversity_loss", "codes", codes, ("R", "B", "D"))
     _checks.check_tensor("diversity_loss", "clouds", clouds, (*codes.shape[:2], "N", 3))
     _checks.check_same_dtype("diversity_loss", codes=codes, clouds=clouds)
-    if not math.isfinite(alpha):
-        raise _checks.fail("diversity_loss", "alpha", "be finite", repr(alpha))
-    if not torch.compiler.is_compiling():
-        _checks.check_finite("diversity_loss", "codes", codes.detach())
+    alpha = _checks.check_number("diversity_loss", "alpha", alpha, "be finite", math.isfinite)
+    _checks.check_finite("diversity_loss", "codes", codes.detach())
     first, second = _pairs("diversity_loss", "codes", codes.shape[0])
     apart = (codes[first] - codes[second]).norm(dim=-1)
     # From this distance on the hinge is 0, so the exact distance is not needed.

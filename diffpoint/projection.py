@@ -15,7 +15,7 @@ from diffpoint import _checks
 from diffpoint.camera import PinholeCamera, check_views
 from diffpoint.distances import nearest
 from diffpoint.losses import Reduction, check_maps, reduce_loss
-from diffpoint.soft_splat import soft_splat
+from diffpoint.soft_splat import check_footprint, soft_splat
 from diffpoint.splat import splat_depth
 
 EMPTY_LOGIT = -1.0
@@ -74,9 +74,10 @@ def projection_loss(
         >>> projection_loss(cloud, camera, splat_depth(cloud, camera).depth).item()
         0.0
     """
-    _check("projection_loss", points, camera, depth, mask_weight=mask_weight)
-    if not isinstance(upsample, int) or isinstance(upsample, bool) or upsample < 1:
-        raise _checks.fail("projection_loss", "upsample", "be a whole number of at least 1", repr(upsample))
+    mask_weight = _check("projection_loss", points, camera, depth, mask_weight=mask_weight)
+    upsample = _checks.check_integer(
+        "projection_loss", "upsample", upsample, "be a whole number of at least 1", 1
+    )
     camera = check_views("projection_loss", "camera", camera, points, views=depth.shape[1]).camera
     if logits is None:
         rendered, index = _pseudo_render(points, camera, upsample=upsample)
@@ -185,7 +186,8 @@ def soft_projection_loss(
         >>> bool(cloud.grad[0, 0, 0] < 0)  # the point lies beside the silhouette: descent moves it in
         True
     """
-    _check("soft_projection_loss", points, camera, depth, mask_weight=mask_weight)
+    mask_weight = _check("soft_projection_loss", points, camera, depth, mask_weight=mask_weight)
+    radius, softness = check_footprint("soft_projection_loss", radius, softness)
     camera = check_views("soft_projection_loss", "camera", camera, points, views=depth.shape[1]).camera
     margin = max(camera.height, camera.width) // 2
     distance = _distance_to(torch.isfinite(depth), margin).to(points)
@@ -226,7 +228,7 @@ def _distance_to(foreground: Tensor, margin: int) -> Tensor:
     pixels = pixels.to(foreground.device, torch.float32)
     flat = foreground.reshape(-1, height * width)
     counts = flat.sum(1)
-    longest = int(counts.max()) if len(flat) else 0
+    longest = int(counts.max()) if len(flat) and _checks.readable(counts) else height * width
     first = flat.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :longest]
     squared = nearest(pixels.expand(len(flat), -1, -1), pixels[first], b_lengths=counts).squared_distance
     distance = torch.where(torch.isfinite(squared), squared, 1.0).sqrt().view(foreground.shape)
@@ -243,16 +245,15 @@ def _nearest_in_frame(size: int, margin: int, like: Tensor) -> tuple[Tensor, Ten
 
 def _check(
     function: str, points: Tensor, camera: PinholeCamera, depth: Tensor, *, mask_weight: float
-) -> None:
+) -> float:
+    """Checks arguments that both losses have; returns `mask_weight` as a float."""
     check_maps(function, points, camera, depth)
-    if not 0 <= mask_weight < float("inf"):
-        raise _checks.fail(function, "mask_weight", "be a finite number of at least 0", repr(mask_weight))
-    if not torch.compiler.is_compiling():
-        _checks.check_depth(function, "depth", depth.detach())
+    _checks.check_depth(function, "depth", depth.detach())
+    expected = "be a finite number of at least 0"
+    return _checks.check_number(function, "mask_weight", mask_weight, expected, lambda x: 0 <= x < math.inf)
 
 
 def _check_logits(logits: Tensor, points: Tensor) -> None:
     _checks.check_tensor("projection_loss", "logits", logits, (points.shape[0], points.shape[1]))
     _checks.check_same_dtype("projection_loss", points=points, logits=logits)
-    if not torch.compiler.is_compiling():
-        _checks.check_finite("projection_loss", "logits", logits.detach())
+    _checks.check_finite("projection_loss", "logits", logits.detach())

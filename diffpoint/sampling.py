@@ -39,11 +39,8 @@ def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Te
     lengths = _checks.check_lengths(
         "farthest_point_sample", "lengths", lengths, batch, points.shape[-2], points
     )
-    for name, value, lowest in (("k", k, 0), ("start", start, 0)):
-        if not isinstance(value, int) or isinstance(value, bool) or value < lowest:
-            raise _checks.fail(
-                "farthest_point_sample", name, f"be an integer of at least {lowest}", repr(value)
-            )
+    k = _checks.check_integer("farthest_point_sample", "k", k, "be an integer of at least 0", 0)
+    start = _checks.check_integer("farthest_point_sample", "start", start, "be an integer of at least 0", 0)
     flat = points.reshape(torch.Size(batch).numel(), *points.shape[-2:])
     lengths = _bridge.full_lengths(lengths, flat.shape[0], flat.shape[1], flat)
     return _farthest(flat, lengths, k, start).reshape(*batch, k)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
+from diffpoint._footprint import least_fade
 from diffpoint.camera import PinholeCamera
 from diffpoint.reproject import project
 
@@ -38,8 +39,9 @@ def soft_splat(
     """Render clouds with soft footprints and soft depth order, so that gradients reach x and y.
 
     A point at pixel position (u, v) covers the pixels whose centres lie within `radius` of it, with the footprint
-    k = (1 - r^2 / radius^2)^2 at distance r: 1 at the point, 0 at the edge, with a continuous derivative. A pixel's
-    depth is the mean of the depths z on it with weights k exp(-z / softness), its coverage the sum of the k.
+    k = (1 - r^2 / radius^2)^2 at distance r: 1 at the point, 0 at the edge, with a continuous derivative; where k is so
+    small that rounding may have made it, the point does not count. A pixel's depth is the mean of the depths z on it
+    with weights k exp(-z / softness), its coverage the sum of the k.
 
     Args:
         points: (B, N, 3) in the world.
@@ -73,9 +75,7 @@ def soft_splat(
         True
     """
     _checks.check_clouds("soft_splat", "points", points)
-    for name, value in (("radius", radius), ("softness", softness)):
-        if not 0 < value < float("inf"):
-            raise _checks.fail("soft_splat", name, "be positive and finite", repr(value))
+    radius, softness = check_footprint("soft_splat", radius, softness)
     lengths = _checks.check_lengths(
         "soft_splat", "lengths", lengths, points.shape[:1], points.shape[1], points
     )
@@ -83,11 +83,19 @@ def soft_splat(
     if lengths is not None:  # the padding may hold NaN
         counts = torch.arange(points.shape[1], device=points.device) < lengths[:, None]
         points = torch.where(counts[..., None], points, 0.0)
-    if not torch.compiler.is_compiling():
-        _checks.check_finite("soft_splat", "points", points.detach())
+    _checks.check_finite("soft_splat", "points", points.detach())
     pixels, depth = project(points, camera)
-    maps = _soft_splat(pixels, depth, whole, camera.height, camera.width, float(radius), float(softness))
+    maps = _soft_splat(pixels, depth, whole, camera.height, camera.width, radius, softness)
     return SoftSplat(maps[0], maps[1])
+
+
+def check_footprint(function: str, radius: float, softness: float) -> tuple[float, float]:
+    """Both are positive, finite numbers."""
+    radius, softness = (
+        _checks.check_number(function, name, value, "be positive and finite", lambda x: 0 < x < math.inf)
+        for name, value in (("radius", radius), ("softness", softness))
+    )
+    return radius, softness
 
 
 def _soft_splat_fake(
@@ -132,15 +140,17 @@ def _soft_splat(
     """Depth and coverage; then for the backward pass the nearest depth and the sum of the weights."""
     batch, views, count = point_depth.shape
     _checks.check_lengths_range("soft_splat", "lengths", lengths, count)
-    maps = [point_depth.new_empty(batch * views * height * width) for _ in range(4)]
+    depth, coverage, nearest, weight = (
+        point_depth.new_empty((batch, views, height, width)) for _ in range(4)
+    )
+    maps = [m.view(-1) for m in (depth, coverage, nearest, weight)]
     if point_depth.numel():
         inputs = pixels.reshape(-1), point_depth.reshape(-1), lengths
-        sizes = views, count, height, width, radius, softness
+        sizes = views, count, height, width, radius, softness, least_fade(depth, radius)
         _bridge.launch("soft_splat", "forward", point_depth.dtype, *inputs, *maps, *sizes)
     else:
         for values, empty in zip(maps, (math.inf, 0.0, math.inf, 0.0), strict=True):
             values.fill_(empty)
-    depth, coverage, nearest, weight = (m.view(batch, views, height, width) for m in maps)
     return depth, coverage, nearest, weight
 
 
@@ -169,6 +179,6 @@ def _soft_splat_backward(
         inputs = pixels.reshape(-1), point_depth.reshape(-1), lengths
         maps = (m.reshape(-1) for m in (depth, nearest, weight, grad_depth, grad_coverage))
         outputs = grad_pixels.view(-1), grad_point_depth.view(-1)
-        sizes = views, count, *depth.shape[2:], radius, softness
+        sizes = views, count, *depth.shape[2:], radius, softness, least_fade(depth, radius)
         _bridge.launch("soft_splat", "backward", point_depth.dtype, *inputs, *maps, *outputs, *sizes)
     return grad_pixels, grad_point_depth

@@ -42,8 +42,7 @@ def approxmatch(
     """
     name = "approxmatch"
     a3, b3, la, lb, batch = paired_sets(name, a, b, a_lengths, b_lengths)
-    with_gradient = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
-    return _approxmatch(a3, b3, la, lb, with_gradient)[0].reshape(batch)
+    return _approxmatch(a3, b3, la, lb, _checks.differentiated(a, b))[0].reshape(batch)
 
 
 def _fake(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, with_gradient: bool):

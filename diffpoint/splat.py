@@ -57,13 +57,18 @@ def splat_depth(
         [[[False, True]]]
     """
     _checks.check_clouds("splat_depth", "points", points)
-    if not radius >= 0 or radius == float("inf"):
-        raise _checks.fail("splat_depth", "radius", "be a finite number of pixels, at least 0", repr(radius))
+    radius = _checks.check_number(
+        "splat_depth",
+        "radius",
+        radius,
+        "be a finite number of pixels, at least 0",
+        lambda r: 0 <= r < math.inf,
+    )
     batch = points.shape[0]
     lengths = _checks.check_lengths("splat_depth", "lengths", lengths, (batch,), points.shape[1], points)
     views = check_views("splat_depth", "camera", camera, points)
     lengths = _bridge.full_lengths(lengths, batch, points.shape[1], points)
-    return Splat(*_splat(points, lengths, views.projection, camera.height, camera.width, float(radius)))
+    return Splat(*_splat(points, lengths, views.projection, camera.height, camera.width, radius))
 
 
 def _splat_fake(points: Tensor, lengths: Tensor, projection: Tensor, height: int, width: int, radius: float):

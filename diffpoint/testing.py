@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from diffpoint import _bridge
+from diffpoint import _bridge, _checks
 from diffpoint.camera import PinholeCamera, check_views
 
 # Per dtype, relative to the size of the values; large enough for sums of a few thousand terms.
@@ -76,7 +76,8 @@ def boundary_points(points: Tensor, camera: PinholeCamera, *, margin: float = 1e
     """
     projection = check_views("boundary_points", "camera", camera, points).projection
     ones = torch.ones_like(points[..., :1])
-    homogeneous = torch.cat((points, ones), -1)[:, None] @ projection.mT
+    with _checks.full_precision(points):
+        homogeneous = torch.cat((points, ones), -1)[:, None] @ projection.mT
     depth = homogeneous[..., 2]
     pixels = homogeneous[..., :2] / torch.where(depth == 0, 1.0, depth)[..., None]
     return ((pixels - pixels.round()).abs() < margin).any(-1) | (depth.abs() < margin)

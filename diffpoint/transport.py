@@ -12,9 +12,6 @@ from diffpoint import _auction, _bridge, _checks
 from diffpoint.distances import paired_sets
 from diffpoint.sampling import lanes
 
-# The smallest bid increment, relative to the extent of the pair: the resolution of the prices' dtype.
-RESOLUTION = {torch.float32: 2e-6, torch.float64: 1e-12}
-
 
 class Transport(NamedTuple):
     """An assignment between two sets, its cost, and a bound on its distance from the optimum."""
@@ -80,8 +77,7 @@ def earth_mover_distance(
     """
     name = "earth_mover_distance"
     a3, b3, la, lb, batch = paired_sets(name, a, b, a_lengths, b_lengths)
-    if not 0 < tolerance < 1:
-        raise _checks.fail(name, "tolerance", "lie between 0 and 1", repr(tolerance))
+    tolerance = _checks.check_number(name, "tolerance", tolerance, "lie between 0 and 1", lambda x: 0 < x < 1)
     prices, known_cost = _start(name, start, a, b)
     if enough is None:
         limit = a.new_full((a3.shape[0],), torch.inf)
@@ -90,7 +86,7 @@ def earth_mover_distance(
         _checks.check_same_dtype(name, a=a, enough=enough)
         limit = enough.detach().reshape(-1)
     cost, assignment, bound, converged, prices = _transport(
-        a3, b3, la, lb, prices, known_cost, limit, float(tolerance)
+        a3, b3, la, lb, prices, known_cost, limit, tolerance
     )
     return Transport(
         cost.reshape(batch),
@@ -162,7 +158,7 @@ def _transport(
     enough: Tensor,
     tolerance: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    extent = check_values(a, b, a_lengths, b_lengths, prices, known_cost)
+    extent = _checks.check_transport(a, b, a_lengths, b_lengths, prices, known_cost)
     count, n, m = a.shape[0], a.shape[1], b.shape[1]
     bound = torch.zeros(count, dtype=torch.float64)
     finished = torch.ones(count, dtype=torch.uint8)
@@ -209,7 +205,7 @@ def _transport(
         bound,
         finished,
         float(tolerance),
-        RESOLUTION[a.dtype],
+        _auction.RESOLUTION[a.dtype.itemsize],
         _auction.BIDS_PER_PERSON,
     )
     # Indexed by the points of `a`; partners beyond the number of persons are dummy persons.
@@ -223,33 +219,6 @@ def _transport(
     is_object = torch.arange(size) < object_counts[:, None]
     prices = torch.where(is_object, prices - prices.amin(1, keepdim=True), 0)
     return cost, assignment, bound.to(a.dtype), finished.view(torch.bool), prices
-
-
-def check_values(
-    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, prices: Tensor, known_cost: Tensor
-) -> Tensor:
-    """Checks the values of the operator's arguments, on any device. Returns the extent (B,) of each pair."""
-    name = "earth_mover_distance"
-    _checks.check_sets(name, a, b, a_lengths, b_lengths, smallest=1)
-    for argument, values in (("start.prices", prices), ("start.cost", known_cost)):
-        _checks.check_finite(name, argument, values)
-    extent = _extent(a.detach(), a_lengths, b.detach(), b_lengths)
-    if not bool((extent < _auction.LARGEST_EXTENT).all()):
-        raise _checks.fail(
-            name, "a", "span less than 1e18 together with 'b'", f"{extent.max():.3g}", "Scale both down."
-        )
-    return extent
-
-
-def _extent(a: Tensor, a_lengths: Tensor, b: Tensor, b_lengths: Tensor) -> Tensor:
-    """Diagonal of the bounding box of each pair; at least 1e-20, because bid increments are relative to it."""
-    low, high = [], []
-    for cloud, counts in ((a, a_lengths), (b, b_lengths)):
-        padding = (torch.arange(cloud.shape[1], device=cloud.device) >= counts[:, None])[..., None]
-        low.append(cloud.masked_fill(padding, torch.inf).amin(1))
-        high.append(cloud.masked_fill(padding, -torch.inf).amax(1))
-    diagonal = (torch.maximum(*high) - torch.minimum(*low)).norm(dim=-1, dtype=torch.float64).to(a.dtype)
-    return diagonal.clamp(min=1e-20)
 
 
 @_bridge.register(

@@ -71,15 +71,21 @@ def visible_points(
     """
     _checks.check_clouds("visible_points", "points", points)
     _checks.check_choice("visible_points", "method", method, METHODS)
-    for name, value in (("radius", radius), ("tolerance", tolerance)):
-        if value is not None and not 0 <= value < math.inf:
-            raise _checks.fail("visible_points", name, "be a finite number, at least 0", repr(value))
+    own_radius, own_tolerance = (
+        default
+        if value is None
+        else _checks.check_number(
+            "visible_points", name, value, "be a finite number, at least 0", lambda x: 0 <= x < math.inf
+        )
+        for name, value, default in zip(
+            ("radius", "tolerance"), (radius, tolerance), _DEFAULTS[method], strict=True
+        )
+    )
     batch, count = points.shape[:2]
     lengths = _checks.check_lengths("visible_points", "lengths", lengths, (batch,), count, points)
     views = check_views("visible_points", "camera", camera, points)
     if method == "zbuffer":
         return splat_depth(points.detach(), camera, lengths=lengths).visible
-    own_radius, own_tolerance = _DEFAULTS[method]
     return _visible(
         points.detach(),
         _bridge.full_lengths(lengths, batch, count, points),
@@ -87,8 +93,8 @@ def visible_points(
         camera.height,
         camera.width,
         method,
-        own_radius if radius is None else float(radius),
-        own_tolerance if tolerance is None else float(tolerance),
+        own_radius,
+        own_tolerance,
     )
 
 

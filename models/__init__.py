@@ -3,6 +3,7 @@
 from models.autoencoder import LATENT_DIM, Autoencoder, AutoencoderConfig, build_autoencoder
 from models.critic import Critic, critic_loss, generator_loss, gradient_penalty
 from models.generator import Generator, Prediction, build_generator
+from models.parts import allow_tf32
 from models.predictor import Predictor
 from models.sizes import CODE_DIM, PROFILES, GeneratorConfig
 from models.widen import widen
@@ -18,6 +19,7 @@ __all__ = [
     "GeneratorConfig",
     "Prediction",
     "Predictor",
+    "allow_tf32",
     "build_autoencoder",
     "build_generator",
     "critic_loss",

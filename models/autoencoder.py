@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 LATENT_DIM = 128
 _HIDDEN = 256
-_CACHED_POINTS = 2048
+_CACHED_POINTS, _GPU_POINTS = 2048, 2**18
+"""Points that are encoded at a time without a graph: on a CPU, and on a GPU, which needs more of them to be busy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +98,7 @@ class Autoencoder(nn.Module):
                 "Autoencoder: encode_frozen is for a network in eval mode; call freeze() first"
             )
         layers = self._folded()
-        at_once = max(1, _CACHED_POINTS // points.shape[1])
+        at_once = max(1, (_CACHED_POINTS if points.is_cpu else _GPU_POINTS) // points.shape[1])
         with torch.no_grad():
             # (B, LATENT_DIM) each: the maximum over points, and the point that has it.
             maxima = [_point_features(layers, some).max(1) for some in points.split(at_once)]

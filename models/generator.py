@@ -19,7 +19,15 @@ import torch
 from torch import Tensor
 
 from models.autoencoder import Autoencoder, ShapeDecoder
-from models.parts import CodeBranch, LatentDecoder, PointDecoder, image_trunk, initialise, prepare_images
+from models.parts import (
+    CodeBranch,
+    LatentDecoder,
+    PointDecoder,
+    image_trunk,
+    initialise,
+    precision,
+    prepare_images,
+)
 from models.predictor import Predictor
 from models.sizes import CODE_DIM, PROFILES, GeneratorConfig, OutputHead
 
@@ -80,7 +88,9 @@ class Generator(Predictor):
     joins_views = True
     computes_in: torch.dtype = torch.float32
     """torch.bfloat16 computes all layers but the last in half precision: about twice as fast where the processor
-    has instructions for it (avx512_bf16, amx), slower elsewhere. Weights and points stay float32."""
+    has instructions for it (avx512_bf16, amx, GPUs since Ampere), slower elsewhere. Weights and points stay float32."""
+    tf32: bool = False
+    """On an NVIDIA GPU, all layers but the last round the factors of their products to TF32; see `allow_tf32`."""
 
     def __init__(self, config: GeneratorConfig) -> None:
         super().__init__()
@@ -143,7 +153,7 @@ class Generator(Predictor):
     def encode(self, images: Tensor) -> Tensor:
         """(B, 3, H, W) images in [0, 1] -> (B, C, H/8, W/8) features, independent of the codes."""
         prepared = prepare_images(images, (self.config.image_height, self.config.image_width))
-        with self._precision(images):
+        with precision(images, self.computes_in, tf32=self.tf32):
             return self.trunk(prepared.contiguous(memory_format=torch.channels_last))
 
     def decode(self, features: Tensor, codes: Tensor) -> Tensor:
@@ -157,7 +167,7 @@ class Generator(Predictor):
     def _decode(self, features: Tensor, codes: Tensor) -> Prediction:
         self.check_codes(codes, len(features))
         repeats = len(codes)
-        with self._precision(features):
+        with precision(features, self.computes_in, tf32=self.tf32):
             if self.code_branch is None:
                 made = self.decoder(features)[None]
             else:
@@ -169,10 +179,6 @@ class Generator(Predictor):
         if self.shape_decoder is None:
             return Prediction(made, None)
         return Prediction(self.shape_decoder(made.flatten(0, 1)).unflatten(0, made.shape[:2]), made)
-
-    def _precision(self, like: Tensor) -> torch.autocast:
-        half = self.computes_in != torch.float32
-        return torch.autocast(like.device.type, dtype=self.computes_in if half else None, enabled=half)
 
     @staticmethod
     def _join(features: Tensor, code_features: Tensor, repeats: int) -> Tensor:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,9 +26,37 @@ def prepare_images(images: Tensor, size: tuple[int, int]) -> Tensor:
     return (images - IMAGE_MEAN) * IMAGE_GAIN
 
 
-def full_precision(like: Tensor) -> torch.autocast:
-    """A context for layers that output coordinates: bfloat16 would round them to 1/500 of an object's size."""
-    return torch.autocast(like.device.type, enabled=False)
+@contextmanager
+def precision(like: Tensor, dtype: torch.dtype = torch.float32, *, tf32: bool = False) -> Iterator[None]:
+    """A context for layers of a network: the number format in which they multiply.
+
+    Args:
+        like: a tensor on the network's device.
+        dtype: torch.float32, or torch.bfloat16 for autocast.
+        tf32: on an NVIDIA GPU, round the factors of float32 products to TF32.
+    """
+    half = dtype != torch.float32
+    products: Any = nullcontext() if like.is_cpu else allow_tf32(tf32)
+    with torch.autocast(like.device.type, dtype=dtype if half else None, enabled=half), products:
+        yield
+
+
+@contextmanager
+def allow_tf32(allowed: bool) -> Iterator[None]:
+    """Inside, products of float32 matrices and convolutions on an NVIDIA GPU round their factors to TF32, or do not.
+
+    TF32 has 10 bits of mantissa and several times the speed. The switch is the whole process's: a backward pass rounds
+    as the switch is when it runs.
+    """
+    switches: tuple[Any, Any] = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = [switch.allow_tf32 for switch in switches]
+    try:
+        for switch in switches:
+            switch.allow_tf32 = allowed
+        yield
+    finally:
+        for switch, was in zip(switches, before, strict=True):
+            switch.allow_tf32 = was
 
 
 def _widen(channels: int, factor: float) -> int:
@@ -110,7 +141,7 @@ class LatentDecoder(_Contraction):
 
     def forward(self, joined: Tensor) -> Tensor:
         vector = self.contract(joined)[-1]
-        with full_precision(joined):
+        with precision(joined):  # bfloat16 would round coordinates to 1/500 of an object's size
             return self.latent(vector.float())
 
 
@@ -139,7 +170,7 @@ class PointDecoder(_Contraction):
         x = self.merge4(F.relu(_crop(self.up4(x), x4) + self.skip4(x4)))
         # Only this sum has a ReLU before it, as in the released network and in PSGN.
         x = self.merge3(F.relu(F.relu(_crop(self.up3(x), joined)) + self.skip3(joined)))
-        with full_precision(joined):
+        with precision(joined):
             fc_points = self.fc_points(vector.float()).unflatten(1, (-1, self.values))
             conv_points = (
                 self.conv_points(x.float()).permute(0, 2, 3, 1).reshape(len(joined), -1, self.values)

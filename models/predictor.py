@@ -6,9 +6,11 @@ its clouds is each network's own.
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from typing import ClassVar, Protocol
 
+import torch
 from torch import Tensor, nn
 
 
@@ -62,6 +64,12 @@ class Predictor(nn.Module, ABC):
     def profile(self) -> str:
         """Name of the size this network was built to."""
         return self.config.profile
+
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are, and where its inputs must be; the CPU for a network without weights."""
+        weights = next(itertools.chain(self.parameters(), self.buffers()), None)
+        return torch.device("cpu") if weights is None else weights.device
 
     @abstractmethod
     def forward(self, images: Tensor, codes: Tensor) -> Tensor:

@@ -54,5 +54,5 @@ def widen(wide: nn.Module, narrow: nn.Module) -> None:
 def _share_among_repeats(weight: Tensor, repeats: int, input_dim: int) -> None:
     """Divides the weights of an input unequally among its repeats, in place; their sum stays."""
     by_repeat = weight.unflatten(input_dim, (repeats, -1))
-    shares = 1 + _SPREAD * torch.randn_like(by_repeat)
+    shares = 1 + _SPREAD * torch.randn_like(by_repeat.cpu()).to(by_repeat.device)  # the same on every device
     by_repeat *= (1 + shares - shares.mean(input_dim, keepdim=True)) / repeats

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch: its idle threads would slow the kernels
-if not Path(
-    "/dev/nvidia0"
-).exists():  # before triton: tests/test_cuda_kernels.py runs its kernels in the interpreter
+# Tests compare commands with functions; those of a GPU name it.
+os.environ.setdefault("DIFFPOINT_DEVICE", "cpu")
+# Before triton: tests/test_cuda_kernels.py runs its kernels in the interpreter where there is no GPU.
+if not Path("/dev/nvidia0").exists():
     os.environ.setdefault("TRITON_INTERPRET", "1")
 
 from typing import TYPE_CHECKING

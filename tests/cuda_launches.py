@@ -70,17 +70,27 @@ def compile_launches(launches: dict[str, dict], folder: Path) -> None:
     assert len(done.stdout.splitlines()) == 2 * len(launches)
 
 
+def on_device(function: Callable, *arguments: Any) -> list[torch.Tensor]:
+    """A function's results with arguments on the GPU, or with the interpreter, moved to the CPU."""
+    return [result.cpu() for result in function(*(a.to(DEVICE) for a in arguments))]
+
+
 def on_cpu(function: Callable, *arguments: Any) -> Any:
     """The result of the CPU kernels, which have tests of their own."""
     before, _bridge.interpreted = _bridge.interpreted, False
     try:
-        return function(*arguments)
+        return function(*(a.cpu() for a in arguments))
     finally:
         _bridge.interpreted = before
 
 
 def assert_same(function: Callable, *arguments: Any) -> None:
-    """The kernels for CUDA give what those for the CPU give; sums up to rounding of their largest terms."""
-    for here, there in zip(function(*arguments), on_cpu(function, *arguments), strict=True):
+    """The kernels for CUDA give what those for the CPU give, sums up to rounding of their largest terms; and the same
+    bits again."""
+    results = on_device(function, *arguments)
+    if ON_GPU:
+        for here, again in zip(results, on_device(function, *arguments), strict=True):
+            assert torch.equal(here, again)
+    for here, there in zip(results, on_cpu(function, *arguments), strict=True):
         finite = there.detach()[torch.isfinite(there)].double().abs()
         assert_close(here, there, scale=max(1.0, float(finite.max())) if finite.numel() else 1.0)

@@ -13,7 +13,7 @@ from test_operators import operator_arguments
 import diffpoint as dp
 
 pytest.importorskip("triton", reason="triton has no wheel here")
-from cuda_launches import DEVICE, ON_GPU, assert_same, compile_launches, on_cpu, recorded_launches
+from cuda_launches import DEVICE, ON_GPU, assert_same, compile_launches, on_cpu, on_device, recorded_launches
 
 from diffpoint.cuda import _MODULE_OF as kernels_of_operators
 from diffpoint.cuda import errors
@@ -71,6 +71,11 @@ CAMERA = dp.PinholeCamera.look_at(
 )
 
 
+def ramp(values: torch.Tensor) -> torch.Tensor:
+    """A weight for each value, all different."""
+    return torch.linspace(-1, 1, values.numel(), dtype=values.dtype, device=values.device).view_as(values)
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("radius", [0.0, 0.3, 1.0, 2.6])
 def test_splat(dtype, radius):
@@ -81,11 +86,11 @@ def test_splat(dtype, radius):
 
     def outputs(points, lengths):
         points = points.clone().requires_grad_()
-        camera = CAMERA.to(dtype)
+        camera = CAMERA.to(points)
         matrices = camera.cam_from_world.clone().requires_grad_()
         camera = dp.PinholeCamera(camera.K, matrices, 16, 14)
         maps = dp.splat_depth(points, camera, radius=radius, lengths=lengths)
-        weights = torch.linspace(0, 1, maps.depth.numel(), dtype=dtype).view_as(maps.depth)
+        weights = ramp(maps.depth)
         total = (torch.where(maps.index >= 0, maps.depth, 0.0) * weights).sum()
         return [*maps, *torch.autograd.grad(total, (points, matrices))]
 
@@ -101,7 +106,7 @@ def test_sample_view(dtype):
     def outputs(points, visible):
         points = points.clone().requires_grad_()
         sample = dp.sample_view(points, visible)
-        weights = torch.linspace(0, 1, sample.points.numel(), dtype=dtype).view_as(sample.points)
+        weights = ramp(sample.points)
         return [*sample, *torch.autograd.grad((sample.points * weights).sum(), points)]
 
     assert_same(outputs, points, visible)
@@ -113,13 +118,13 @@ def test_projections(dtype):
     depth = dp.splat_depth(points, CAMERA.to(dtype), radius=1.0).depth
 
     def outputs(points, depth):
-        inputs = [points, depth, CAMERA.to(dtype).cam_from_world, CAMERA.to(dtype).K]
+        inputs = [points, depth, CAMERA.to(points).cam_from_world, CAMERA.to(points).K]
         points, depth, matrices, K = inputs = [x.clone().requires_grad_() for x in inputs]
         camera = dp.PinholeCamera(K, matrices, 16, 14)
         found = [*dp.project(points, camera), *dp.unproject(depth, camera)]
         found += dp.reproject(depth, camera, camera[[1, 0]])
         values = [torch.where(torch.isfinite(x), x, 0.0) for x in found if x.is_floating_point()]
-        total = sum((x * torch.linspace(-1, 1, x.numel(), dtype=dtype).view_as(x)).sum() for x in values)
+        total = sum((x * ramp(x)).sum() for x in values)
         return [*found, *torch.autograd.grad(total, inputs)]
 
     assert_same(outputs, points, depth)
@@ -147,9 +152,9 @@ def test_soft_splat(dtype, radius, softness):
 
     def outputs(points, lengths):
         points = points.clone().requires_grad_()
-        camera = CAMERA.to(dtype)
+        camera = CAMERA.to(points)
         soft = dp.soft_splat(points, camera, radius=radius, softness=softness, lengths=lengths)
-        weights = torch.linspace(0, 1, soft.depth.numel(), dtype=dtype).view_as(soft.depth)
+        weights = ramp(soft.depth)
         total = (torch.where(soft.coverage > 0, soft.depth, 0.0) * weights + soft.mask).sum()
         return [*soft, *torch.autograd.grad(total, points)]
 
@@ -168,9 +173,9 @@ def test_horizon(dtype):
     )
 
     def outputs(points, lengths):
-        return [dp.visible_points(points, camera.to(dtype), method="horizon", lengths=lengths)]
+        return [dp.visible_points(points, camera.to(points), method="horizon", lengths=lengths)]
 
-    (here,), (there,) = outputs(points, lengths), on_cpu(outputs, points, lengths)
+    (here,), (there,) = on_device(outputs, points, lengths), on_cpu(outputs, points, lengths)
     assert 0.2 < there.double().mean() < 0.6
     assert (here != there).double().mean() < 0.002  # logarithms are rounded differently
 

@@ -1,14 +1,18 @@
 """Errors of every op name the argument, what is expected and what was passed."""
 
+import fractions
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 
 import diffpoint as dp
+from diffpoint import io
 
 CAMERA = dp.PinholeCamera.look_at(torch.tensor([[0.0, 0, -2], [2, 0, 0]]), focal_px=20.0, height=8, width=8)
 DEPTH = torch.full((2, 2, 8, 8), 2.0)
+POINTS = torch.rand(2, 5, 3, generator=torch.Generator().manual_seed(0)) - 0.5
 Ops = dict[str, Callable]
 
 # Each op with one cloud-like argument left open.
@@ -85,6 +89,33 @@ def test_mixed_dtypes(op):
 def test_what_is_no_tensor(op):
     with pytest.raises(TypeError, match=r"must be a torch\.Tensor; got list"):
         (CLOUDS | SETS)[op]([[0.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("op", CLOUDS | SETS)
+def test_arrays_and_tensors_of_other_layouts(op):
+    call = (CLOUDS | SETS)[op]
+    with pytest.raises(
+        TypeError, match=r"must be a torch\.Tensor; got ndarray\. Convert it with torch\.from_numpy\."
+    ):
+        call(np.zeros((2, 7, 3)))
+    with pytest.raises(TypeError, match=r"must be a dense tensor; got a torch\.sparse_coo one"):
+        call(torch.zeros(2, 7, 3).to_sparse())
+
+
+def test_cameras_of_arrays():
+    K, R, T = np.eye(3), np.eye(3), np.zeros(3)
+    tensor = torch.eye(3, dtype=torch.float64)
+    for name, call in (
+        ("PinholeCamera: 'K'", lambda: dp.PinholeCamera(K, torch.eye(4), 3, 3)),
+        (
+            "PinholeCamera.from_opengl: 'cam_from_world'",
+            lambda: dp.PinholeCamera.from_opengl(K, np.eye(4), 3, 3),
+        ),
+        ("PinholeCamera.from_pytorch3d: 'R'", lambda: dp.PinholeCamera.from_pytorch3d(R, T, K, 3, 3)),
+        ("PinholeCamera.from_pytorch3d: 'T'", lambda: dp.PinholeCamera.from_pytorch3d(tensor, T, K, 3, 3)),
+    ):
+        with pytest.raises(TypeError, match=rf"^{name} must be a torch\.Tensor; got ndarray\. Convert"):
+            call()
 
 
 @pytest.mark.parametrize("op", MAPS)
@@ -176,3 +207,127 @@ def test_options_out_of_range():
     ):
         with pytest.raises(ValueError, match=message):
             call()
+
+
+@pytest.mark.parametrize("op", CLOUDS | SETS)
+@pytest.mark.parametrize("shape", [(2, 7, 2), (7, 2), (2, 7, 4), (2,)])
+def test_a_wrong_last_size_is_named(op, shape):
+    """Also where a dimension is missing, as in a cloud (7, 2) of points in the plane."""
+    with pytest.raises(ValueError, match=rf"The last size must be 3, not {shape[-1]}\.$"):
+        (CLOUDS | SETS)[op](torch.rand(shape))
+
+
+NUMBERS: dict[str, tuple[str, Callable]] = {
+    "splat_depth": ("radius", lambda x: dp.splat_depth(POINTS, CAMERA, radius=x)),
+    "soft_splat": ("radius", lambda x: dp.soft_splat(POINTS, CAMERA, radius=x)),
+    "soft_splat softness": ("softness", lambda x: dp.soft_splat(POINTS, CAMERA, softness=x)),
+    "soft_projection_loss": (
+        "softness",
+        lambda x: dp.soft_projection_loss(POINTS, CAMERA, DEPTH, softness=x),
+    ),
+    "soft_projection_loss radius": (
+        "radius",
+        lambda x: dp.soft_projection_loss(POINTS, CAMERA, DEPTH, radius=x),
+    ),
+    "projection_loss": ("mask_weight", lambda x: dp.projection_loss(POINTS, CAMERA, DEPTH, mask_weight=x)),
+    "visible_points": ("radius", lambda x: dp.visible_points(POINTS, CAMERA, method="horizon", radius=x)),
+    "visible_points tolerance": (
+        "tolerance",
+        lambda x: dp.visible_points(POINTS, CAMERA, method="horizon", tolerance=x),
+    ),
+    "earth_mover_distance": ("tolerance", lambda x: dp.earth_mover_distance(POINTS, POINTS, tolerance=x)),
+    "diversity_loss": (
+        "alpha",
+        lambda x: dp.diversity_loss(torch.ones(2, 2, 4), POINTS.expand(2, 2, 5, 3), alpha=x),
+    ),
+    "PinholeCamera.look_at": (
+        "focal_px",
+        lambda x: dp.PinholeCamera.look_at((0, 0, -2), focal_px=x, height=8, width=8).K,
+    ),
+    "encode_depth": ("max_depth", lambda x: io.encode_depth(DEPTH / 8, max_depth=x)),
+    "decode_depth": ("max_depth", lambda x: io.decode_depth(np.array([1], np.uint16), max_depth=x)),
+}
+INTEGERS: dict[str, tuple[str, Callable]] = {
+    "farthest_point_sample": ("k", lambda x: dp.farthest_point_sample(POINTS, x)),
+    "farthest_point_sample start": ("start", lambda x: dp.farthest_point_sample(POINTS, 2, start=x)),
+    "PinholeCamera": ("height", lambda x: dp.PinholeCamera(CAMERA.K, CAMERA.cam_from_world, x, 2).height),
+    "PinholeCamera width": (
+        "width",
+        lambda x: dp.PinholeCamera(CAMERA.K, CAMERA.cam_from_world, 2, x).resize(x, x).width,
+    ),
+    "projection_loss": ("upsample", lambda x: dp.projection_loss(POINTS, CAMERA, DEPTH, upsample=x)),
+}
+
+
+def leaves(result: object) -> list[torch.Tensor]:
+    return [torch.as_tensor(leaf) for leaf in torch.utils._pytree.tree_leaves(result)]
+
+
+@pytest.mark.parametrize("op", NUMBERS)
+def test_numbers_are_those_of_python_and_numpy(op):
+    name, call = NUMBERS[op]
+    plain = leaves(call(0.5))
+    for number in (np.float64(0.5), np.float32(0.5), np.float16(0.5), fractions.Fraction(1, 2)):
+        assert all(torch.equal(x, y) for x, y in zip(leaves(call(number)), plain, strict=True))
+    function = op.split()[0]
+    for tensor in (torch.tensor(0.5), torch.tensor(0.5, requires_grad=True), torch.rand(5)):
+        message = (
+            rf"^{function}: '{name}' must be a Python or numpy number; got a torch\.Tensor, .* no gradient"
+        )
+        with pytest.raises(TypeError, match=message):
+            call(tensor)
+    for other in ("0.5", True, [0.5]):
+        with pytest.raises(TypeError, match=rf"^{function}: '{name}' must be a Python or numpy number; got "):
+            call(other)
+
+
+@pytest.mark.parametrize("op", INTEGERS)
+def test_integers_are_those_of_python_and_numpy(op):
+    name, call = INTEGERS[op]
+    plain = leaves(call(2))
+    for number in (np.int64(2), np.int32(2), np.uint8(2)):
+        assert all(torch.equal(x, y) for x, y in zip(leaves(call(number)), plain, strict=True))
+    for other in (True, np.True_, 2.0, np.float64(2), "2", -1, None):
+        with pytest.raises(
+            ValueError,
+            match=rf"^{op.split()[0]}: '{name}' must be an? (positive integer|integer|whole number)",
+        ):
+            call(other)
+    assert type(dp.PinholeCamera(CAMERA.K, CAMERA.cam_from_world, np.int64(2), 2).height) is int
+
+
+NO_CAMERA = CAMERA.expand(0, 2)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_an_empty_batch_has_an_empty_result(count):
+    """Whatever the size of its sets: none of them is empty."""
+    points = torch.zeros(0, count, 3, requires_grad=True)
+    depth = torch.zeros(0, 2, 8, 8)
+    results = [
+        *dp.nearest(points, points),
+        *dp.chamfer_distance(points, points, squared=True),
+        *dp.earth_mover_distance(points, points),
+        dp.approxmatch(points, points),
+        dp.farthest_point_sample(points, 3),
+        dp.consistency_loss(points[:, None].expand(0, 2, count, 3), reduction="none"),
+        dp.diversity_loss(
+            torch.ones(2, 0, 4), points[None].expand(2, 0, count, 3), alpha=1.0, reduction="none"
+        ),
+    ]
+    for camera in (CAMERA, NO_CAMERA):
+        splat = dp.splat_depth(points, camera)
+        results += [*splat, *dp.sample_view(points, splat), *dp.soft_splat(points, camera)]
+        results += [dp.visible_points(points, camera, method=m) for m in ("zbuffer", "horizon", "hpr")]
+        results += [*dp.project(points, camera), *dp.unproject(depth, camera)]
+        results += [*dp.reproject(depth, camera, camera)]
+        results += [*dp.front_sets(points, camera, depth), *dp.front_terms(points, camera, depth)]
+        for loss in (dp.front_constraint, dp.projection_loss, dp.soft_projection_loss):
+            results.append(loss(points, camera, depth, reduction="none"))
+    for result in results:
+        assert result.shape[0] == 0
+        if result.requires_grad:
+            (gradient,) = torch.autograd.grad(result.sum(), points, retain_graph=True)
+            assert gradient.shape == points.shape
+    two_dimensions = torch.zeros(2, 0, count, 3)
+    assert dp.chamfer_distance(two_dimensions, two_dimensions, squared=True).a_to_b.shape == (2, 0)

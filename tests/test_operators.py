@@ -5,6 +5,7 @@ import torch
 from torch._library.custom_ops import OPDEFS
 
 import diffpoint as dp
+from diffpoint.testing import boundary_points
 
 B, V, N, M, H, W = 2, 2, 9, 7, 6, 5
 
@@ -94,6 +95,38 @@ def test_the_layer_compiles_into_one_graph_and_exports():
     assert torch.allclose(exported(points.detach(), target), plain)
 
 
+LOSSES = {
+    "front_constraint": dp.front_constraint,
+    "front_constraint, emd": lambda *a, **k: dp.front_constraint(*a, distance="emd", tolerance=0.001, **k),
+    "front_terms": lambda *a, **_: dp.front_terms(*a).loss,
+    "projection_loss": dp.projection_loss,
+    "projection_loss, upsampled": lambda *a, **k: dp.projection_loss(*a, upsample=2, mask_weight=0.1, **k),
+    "soft_projection_loss": dp.soft_projection_loss,
+}
+
+
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.filterwarnings("ignore:front_constraint:RuntimeWarning")
+def test_losses_of_views_compile_into_one_graph(name):
+    """Of three views one has an empty depth map, and one sees no predicted point."""
+    generator = torch.Generator().manual_seed(0)
+    points = (torch.rand(2, 60, 3, generator=generator) - 0.5).requires_grad_()
+    eyes = torch.tensor([[0.0, 0, -2], [2, 0.3, 0], [0, 0, -9]])
+    camera = dp.PinholeCamera.look_at(
+        eyes, torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, -20]]), focal_px=30.0, height=16, width=14
+    )
+    depth = torch.where(torch.rand(2, 3, 16, 14, generator=generator) < 0.5, 2.0, torch.inf)
+    depth[:, 1] = torch.inf
+    plain = LOSSES[name](points, camera, depth, reduction="none")
+    compiled = torch.compile(LOSSES[name], backend="aot_eager", fullgraph=True)(
+        points, camera, depth, reduction="none"
+    )
+    torch.testing.assert_close(compiled, plain)
+    assert plain[:, 0].all()
+    ours, theirs = (torch.autograd.grad(loss.sum(), points)[0] for loss in (compiled, plain))
+    torch.testing.assert_close(ours, theirs)
+
+
 @pytest.fixture(scope="module")
 def elsewhere() -> str:
     """A device whose tensors are not in the CPU's memory: torch's lazy device, which needs no accelerator."""
@@ -155,3 +188,45 @@ def test_devices_are_not_mixed(elsewhere):
     ):
         with pytest.raises(ValueError, match=f"'{name}' must be on the device of the other arguments"):
             call()
+
+
+def every_camera() -> list[torch.Tensor]:
+    camera = dp.PinholeCamera.look_at((0.3, 0.4, -2.1), (0.1, 0.2, 0.3), focal_px=30.3, height=16, width=14)
+    R, T = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
+    cameras = [
+        camera,
+        dp.PinholeCamera.from_opengl(camera.K, camera.cam_from_world, 16, 14),
+        dp.PinholeCamera.from_pytorch3d(R, T, camera.K, 16, 14),
+        camera.resize(8, 7),
+    ]
+    return [m for c in cameras for m in (c.K, c.cam_from_world, c.position, c.projection, c.back_projection)]
+
+
+def test_autocast_changes_no_bit():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(2, 60, 3, generator=generator) - 0.5
+    target = torch.rand(2, 50, 3, generator=generator) - 0.5
+
+    def everything() -> list[torch.Tensor]:
+        moved = points.clone().requires_grad_()
+        outputs = every_op(moved, target, CAMERA)
+        depth = outputs[0].detach()
+        outputs += [
+            dp.projection_loss(moved, CAMERA, depth + 0.1, mask_weight=0.1, logits=moved[..., 0]),
+            dp.soft_projection_loss(moved, CAMERA, depth + 0.1),
+            dp.diversity_loss(points[:, None, 0], moved[:, None], alpha=0.1),
+            dp.consistency_loss(moved),
+            dp.visible_points(points, CAMERA, method="hpr"),
+            boundary_points(points, CAMERA),
+        ]
+        total = sum(torch.where(torch.isfinite(o), o, 0.0).sum() for o in outputs if o.requires_grad)
+        return [*outputs, *every_camera(), torch.autograd.grad(total, moved)[0]]
+
+    plain = everything()
+    with torch.autocast("cpu", torch.bfloat16):
+        cast = everything()
+        compiled = torch.compile(lambda x: dp.project(x, CAMERA).pixels, backend="aot_eager", fullgraph=True)
+        assert torch.equal(compiled(points), dp.project(points, CAMERA).pixels)
+    for x, y in zip(plain, cast, strict=True):
+        assert x.dtype == y.dtype
+        assert torch.equal(x, y)

@@ -14,20 +14,21 @@ import torch
 import diffpoint as dp
 from diffpoint import _bridge
 from diffpoint._launch import FastCall
-from diffpoint._runtime import RUNTIME
+from diffpoint._runtime import RUNTIME, available_threads
 
 BACKEND = dp.runtime_info().backend  # taichi, or quadrants if DIFFPOINT_BACKEND is set to it
 USE = "import torch, diffpoint as dp; d = lambda: dp.nearest(torch.zeros(1, 4, 3), torch.ones(1, 5, 3))\n"
 
 
-def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", USE + textwrap.dedent(code)]
-    environment = os.environ | environment
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+def run(code: str, *options: str, **environment: str | None) -> subprocess.CompletedProcess[str]:
+    """Runs USE and `code` in a Python process; variables that are None are removed from its environment."""
+    command = [sys.executable, *options, "-c", USE + textwrap.dedent(code)]
+    whole = {name: value for name, value in (os.environ | environment).items() if value is not None}
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=whole)
 
 
-def printed(code: str, **environment: str) -> str:
-    done = run(code, **environment)
+def printed(code: str, *options: str, **environment: str | None) -> str:
+    done = run(code, *options, **environment)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return done.stdout.strip()
@@ -46,7 +47,8 @@ def test_importing_starts_nothing_and_the_first_op_is_silent():
 
 def test_threads_are_configured_before_the_start_and_refused_after():
     code = """
-        dp.configure(threads=1)
+        import numpy
+        dp.configure(threads=numpy.int64(1))
         d()
         print(dp.runtime_info().threads)
         try:
@@ -60,7 +62,11 @@ def test_threads_are_configured_before_the_start_and_refused_after():
 
 
 def test_a_thread_count_below_one_is_refused():
-    assert "'threads' must be a positive integer" in run("dp.configure(threads=0)").stderr
+    for threads in (0, True, 1.0):
+        with pytest.raises(
+            ValueError, match=r"^configure: 'threads' must be a positive integer or None; got"
+        ):
+            dp.configure(threads=threads)
 
 
 @pytest.mark.parametrize("other", [name for name in ("taichi", "quadrants") if name != BACKEND])
@@ -71,7 +77,7 @@ def test_one_backend_is_chosen_and_started_once_whatever_else_is_imported(other,
         pytest.importorskip(other)
     code = """
         import sys, types
-        from diffpoint._runtime import RUNTIME
+        from diffpoint._runtime import RUNTIME, available_threads
         if INSTALLED:
             import OTHER
         else:
@@ -89,6 +95,93 @@ def test_a_backend_that_does_not_exist_is_refused():
         "DIFFPOINT_BACKEND must be 'taichi' or 'quadrants'; got 'cuda'"
         in run("d()", DIFFPOINT_BACKEND="cuda").stderr
     )
+
+
+NOWHERE = {"HOME": None, "XDG_CACHE_HOME": None}
+CACHED = "d(); print(dp.runtime_info().cache)"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the home directory is in HOME on POSIX systems")
+def test_without_a_home_in_the_environment_the_users_own_is_found():
+    """Daemons and batch jobs have none; Taichi aborts the process."""
+    environment = "import os; os.environ['HOME']"
+    assert printed(CACHED, **NOWHERE) == "True"
+    assert "KeyError: 'HOME'" in run(CACHED + "; " + environment, **NOWHERE).stderr  # it stays as it was
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the home directory is in HOME on POSIX systems")
+def test_without_a_place_for_the_cache_there_is_none(tmp_path):
+    """Where no folder can be made, Taichi crashes at the end of the process, even with its cache turned off."""
+    file = tmp_path / "file"
+    file.touch()
+    assert printed(CACHED, HOME=str(file), XDG_CACHE_HOME=None) == "False"
+    code = "dp.configure(cache=False); " + CACHED
+    assert printed(code, HOME=str(file), XDG_CACHE_HOME=None) == "False"
+    # No home on the list of users either: the stand-in, a folder that everybody can write to, keeps no kernels.
+    code = "import os; os.path.expanduser = lambda path: path; " + CACHED
+    assert printed(code, **NOWHERE, TMPDIR=str(tmp_path)) == "False"
+    assert not list(tmp_path.rglob("*cache*"))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the home directory is in HOME on POSIX systems")
+def test_compiled_kernels_are_kept_for_the_next_process(tmp_path):
+    def kernels() -> dict[Path, int]:
+        return {
+            path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.tic" if BACKEND == "taichi" else "*c")
+        }
+
+    assert printed(CACHED, HOME=str(tmp_path), XDG_CACHE_HOME=None) == "True"
+    first = kernels()
+    assert first
+    assert printed(CACHED, HOME=str(tmp_path), XDG_CACHE_HOME=None) == "True"
+    assert kernels() == first
+
+
+def test_the_compilers_warnings_are_not_the_callers():
+    code = """
+        import io, sys, warnings
+        sys.stdout = io.StringIO()  # as pytest and Jupyter replace it
+        d()
+        before = list(warnings.filters)
+        dp.farthest_point_sample(torch.zeros(1, 3, 3), 2)
+        assert warnings.filters == before
+        print("fine", file=sys.__stdout__)
+    """
+    assert printed(code, "-W", "error") == "fine"
+
+
+def test_threads_are_limited_by_the_cpu_quotas_of_containers(tmp_path):
+    cores = available_threads(tmp_path, tmp_path / "none")
+    assert cores >= 1
+    membership = tmp_path / "membership"
+
+    def threads(files: dict[str, str], groups: str) -> int:
+        root = tmp_path / str(len(list(tmp_path.iterdir())))
+        for name, text in files.items():
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / name).write_text(text + "\n")
+        membership.write_text(groups + "\n")
+        return available_threads(root, membership)
+
+    assert threads({"cpu.max": "max 100000"}, "0::/") == cores
+    assert threads({"cpu.max": "100000 100000"}, "0::/") == 1
+    assert threads({"cpu.max": "20000 100000"}, "0::/") == 1  # part of a core is one thread
+    assert threads({"cpu.max": "110000 100000"}, "0::/") == min(2, cores)
+    assert threads({"cpu.max": "99900000 100000"}, "0::/") == cores
+    # The limit of a group holds for those below it, and it may be the host's path that is known.
+    assert threads({"a/cpu.max": "50000 100000", "a/b/cpu.max": "max 100000"}, "0::/a/b") == 1
+    assert threads({"cpu.max": "50000 100000"}, "0::/system.slice/docker-1234.scope") == 1
+    assert threads({"b/cpu.max": "50000 100000", "cpu.max": "max 100000"}, "0::/a") == cores  # another group
+    # Version 1
+    version1 = "5:memory:/x\n4:cpu,cpuacct:/docker/1234\n1:name=systemd:/"
+    half = {"cpu.cfs_quota_us": "50000", "cpu.cfs_period_us": "100000"}
+    whole = {"cpu.cfs_quota_us": "-1", "cpu.cfs_period_us": "100000"}
+    for folder in ("cpu", "cpu,cpuacct"):
+        assert threads({f"{folder}/{name}": text for name, text in half.items()}, version1) == 1
+        assert threads({f"{folder}/docker/1234/{name}": text for name, text in half.items()}, version1) == 1
+        assert threads({f"{folder}/{name}": text for name, text in whole.items()}, version1) == cores
+    assert threads({f"memory/{name}": text for name, text in half.items()}, version1) == cores
+    assert threads({"cpu.max": "nonsense"}, "no group at all") == cores
 
 
 HOST = """
@@ -196,7 +289,7 @@ def load(tmp_path: Path, method: str) -> subprocess.CompletedProcess[str]:
     program = tmp_path / "program.py"  # spawned workers import it
     program.write_text(textwrap.dedent(LOADER).replace("METHOD", method))
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    command = [sys.executable, "-W", "ignore::DeprecationWarning", str(program)]
+    command = [sys.executable, str(program)]
     return subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment)
 
 
@@ -233,7 +326,7 @@ def test_one_thread_and_two_give_the_same_bits():
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
 
     def digest(threads: str) -> dict[str, str]:
-        command = [sys.executable, "-W", "ignore::DeprecationWarning", str(script), threads]
+        command = [sys.executable, str(script), threads]
         done = subprocess.run(command, capture_output=True, text=True, timeout=450, env=environment)
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout)

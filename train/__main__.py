@@ -46,6 +46,25 @@ Numbers = Annotated[
 """Whole numbers, given as `1,2,4` or as `1 2 4`."""
 
 
+Device = Annotated[
+    Literal["auto", "cpu", "cuda"],
+    arg(
+        help="Where networks are computed: cuda is an NVIDIA GPU, auto one if there is one (or what DIFFPOINT_DEVICE "
+        "says). It has no part in the configuration of a run."
+    ),
+]
+
+
+def _use_device(wanted: str) -> Any:
+    """The device of an option `--device`, with torch set up for it."""
+    from train.device import describe, use_device
+
+    device = use_device(wanted)
+    if device.type != "cpu":
+        print(f"computing on {describe(device)}", file=sys.stderr)
+    return device
+
+
 @dataclasses.dataclass
 class Fit:
     data: tuple[Path, ...]
@@ -57,20 +76,21 @@ class Fit:
     """Continue the run in --out from its newest checkpoint, to the same bits."""
     steps: int | None = None
     """The same number of steps for every phase, ramps in proportion, for a quick trial."""
+    device: Device = "auto"
 
     def run(self) -> int:
         from train.distributed import connect
         from train.training.trainer import fit
 
-        config = self.config
+        config, device = self.config, _use_device(self.device)
         if self.steps is not None:
             if self.steps < 1:
                 raise UserError(f"--steps must be at least 1; got {self.steps}")
             config = with_steps(config, self.steps)
-        if not fit(self.data, self.out, config, resume=self.resume):
+        if not fit(self.data, self.out, config, resume=self.resume, device=device):
             print(f"stopped early and saved; continue with --resume --out {self.out}", file=sys.stderr)
             return 130
-        if connect().is_main:
+        if connect(device).is_main:
             print(
                 f"trained; see {self.out}, or run: python -m train evaluate {self.out} --data {self.data[0]}"
             )
@@ -109,13 +129,15 @@ class Reconstruct:
     """Gradient steps on the codes; the run's own setting if not given."""
     seed: int = 0
     """Draws the codes."""
+    device: Device = "auto"
 
     def run(self) -> None:
         from train.evaluation.reconstruct import reconstruct_to_files
 
         reconstruct_to_files(
-            self.model, self.images, self.out, groups=self.groups, steps=self.steps, seed=self.seed
-        )
+            self.model, self.images, self.out, groups=self.groups, steps=self.steps, seed=self.seed,
+            device=_use_device(self.device),
+        )  # fmt: skip
 
 
 @dataclasses.dataclass
@@ -134,11 +156,13 @@ class Explore:
     """The page, an .html file."""
     seed: int = 0
     """Draws the codes."""
+    device: Device = "auto"
 
     def run(self) -> None:
         from train.evaluation.reconstruct import explore_to_file
 
-        explore_to_file(self.model, self.images, self.out, seed=self.seed)
+        device = _use_device(self.device)
+        explore_to_file(self.model, self.images, self.out, seed=self.seed, device=device)
 
 
 @dataclasses.dataclass
@@ -181,6 +205,7 @@ class Evaluate:
     """Score at most that many shapes."""
     out: Path | None = None
     """Where to write; RUN/evaluation.json if not given."""
+    device: Device = "auto"
 
     def run(self) -> None:
         from train.evaluation.evaluate import evaluate
@@ -193,6 +218,7 @@ class Evaluate:
             views=self.views,
             limit=self.limit,
             out=self.out,
+            device=_use_device(self.device),
         )
 
 
@@ -246,7 +272,7 @@ class Experiment:
     steps: int | None = None
     """The same number of steps for every phase, for a quick look."""
     processes: int | None = None
-    """Trainings or measurements at once, with one core each; as many as there are cores if not given."""
+    """Trainings or measurements at once, with one core each; as many as there are cores if not given, on a GPU one."""
     category: str = "chair"
     """What single-category is about."""
     pictures: Path | None = None
@@ -256,14 +282,18 @@ class Experiment:
     trained if not given."""
     views: int = 8
     """agreement: views per shape."""
+    device: Device = "auto"
 
     def run(self) -> None:
         from train.experiments.run import Study, print_status, run_all, run_experiment, write_page
 
-        processes = os.cpu_count() or 1 if self.processes is None else self.processes
+        device = _use_device(self.device)
+        usual = 1 if device.type == "cuda" else os.cpu_count() or 1
+        processes = usual if self.processes is None else self.processes
         study = Study(
             self.data, self.out, self.profile, self.seeds, self.limit, self.steps, processes=processes,
             category=self.category, pictures=self.pictures, run=self.run_, views=self.views, recipe=self.recipe,
+            device=device,
         )  # fmt: skip
         if self.name == "list":
             print_status(study)
@@ -284,11 +314,12 @@ class Demo:
 
     out: Path = Path("demo")
     """Directory to write to; ends with report.html."""
+    device: Device = "auto"
 
     def run(self) -> None:
         from train.demo import demo
 
-        demo(self.out)
+        demo(self.out, device=_use_device(self.device))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

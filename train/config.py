@@ -24,7 +24,7 @@ Profile = Literal["full", "cpu", "smoke"]
 Recipe = Literal["whole-shapes", "paper"]
 Variant = Literal["standard", "highly-diverse"]
 OutputHead = Literal["points", "latent"]
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["float32", "tf32", "bfloat16"]
 Supervision = Literal["front", "projection", "lin", "soft"]
 # The methods of `diffpoint.visible_points`, whose import would load torch; a test compares them.
 Visibility = Literal["zbuffer", "horizon", "hpr"]
@@ -215,8 +215,9 @@ class FitConfig:
     """Strength of random changes of light, colour, sharpness, noise, size and place of the training images; 0: none, 1:
     as much as photographs need."""
     precision: Precision = "float32"
-    """Number format of the generator during training. bfloat16: all layers but the last, about twice as fast where the
-    processor can multiply such numbers (avx512_bf16, amx; see lscpu), slower elsewhere, and slower with group norms."""
+    """Number format of the generator during training, all layers but the last. bfloat16 is about twice as fast on GPUs
+    and on processors that can multiply such numbers (avx512_bf16, amx; see lscpu), slower elsewhere, and on a CPU
+    slower with group norms. tf32, on NVIDIA GPUs alone, rounds the factors of products to 10 bits of mantissa."""
     autoencoder: str | None = None
     """A run, or a .safetensors file of one, whose auto-encoder is used instead of training one."""
     start: str | None = None
@@ -315,15 +316,24 @@ _OLD_NAMES = {
 }
 
 
+_PRECISIONS = {"32": "float32", "bf16": "bfloat16"}
+"""Other words for values of `--precision`."""
+
+
 def renamed_options(arguments: Sequence[str]) -> list[str]:
-    """Command line arguments with the options of earlier versions replaced by today's."""
+    """Command line arguments with the options of earlier versions, and short forms of values, replaced by today's."""
     options = {f"--{old.replace('_', '-')}": f"--{new.replace('_', '-')}" for old, new in _OLD_NAMES.items()}
 
     def rename(argument: str) -> str:
         name, equals, value = argument.partition("=")
+        value = _PRECISIONS.get(value, value) if name == "--precision" else value
         return options.get(name, name) + equals + value
 
-    return [rename(argument) for argument in arguments]
+    renamed = [rename(argument) for argument in arguments]
+    for at, argument in enumerate(renamed[:-1], 1):
+        if argument == "--precision":
+            renamed[at] = _PRECISIONS.get(renamed[at], renamed[at])
+    return renamed
 
 
 def to_json(config: FitConfig, *, data: str | Path | Sequence[str | Path]) -> str:

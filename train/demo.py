@@ -9,10 +9,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import torch
+
 from train.config import FitConfig, scaled
 from train.data import Shape, ShapeTree
 from train.data.procedural import generate
 from train.data.tree_files import SPLITS, render_folder
+from train.device import CPU
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate
 from train.evaluation.examples import make_example, report_run
@@ -44,6 +47,7 @@ def demo(
     seed: int = 0,
     config: FitConfig = DEMO_CONFIG,
     progress: bool = True,
+    device: torch.device = CPU,
 ) -> Path:
     """Shows the shipped weights, then runs the whole chain; a second call continues where the first was stopped.
 
@@ -54,6 +58,7 @@ def demo(
         seed: of data and examples.
         config: the training's configuration.
         progress: show progress bars.
+        device: where networks are trained and evaluated.
 
     Returns:
         The report, out/report.html.
@@ -70,7 +75,7 @@ def demo(
     with clock.phase(
         "first look", "1/6 the weights that come with the repository, on objects they have not seen"
     ):
-        section = _shipped_weights(out, seed=seed)
+        section = _shipped_weights(out, seed=seed, device=device)
     print(f"Open {out / 'report.html'} in a browser; it is completed at the end.")
 
     with clock.phase("data", f"2/6 {shapes} objects with three possible backs each -> {data}"):
@@ -80,13 +85,14 @@ def demo(
         print(made.summary())
 
     with clock.phase("training", f"3/6 training a small network, {steps} steps -> {run}"):
-        finished = fit(data, run, config, resume=(run / "config.json").exists(), progress=progress)
+        resume = (run / "config.json").exists()
+        finished = fit(data, run, config, resume=resume, progress=progress, device=device)
         if not finished:
             raise KeyboardInterrupt
 
     with clock.phase("evaluation", "4/6 evaluation on shapes that were not used for training"):
         if not _up_to_date(run):
-            evaluate(run, data, progress=progress)
+            evaluate(run, data, progress=progress, device=device)
 
     test = ShapeTree(data, "test")
     images = sorted(render_folder(data, test.ids[0]).glob("render_*.png"))
@@ -94,15 +100,17 @@ def demo(
         "reconstruction",
         f"5/6 reconstruction of one of them from {len(images)} images -> {out / 'reconstruction'}",
     ):
-        reconstruct_to_files(run, images, out / "reconstruction", seed=seed)
+        reconstruct_to_files(run, images, out / "reconstruction", seed=seed, device=device)
 
     with clock.phase("report", "6/6 the report"):
-        page = report_run(out, run=run, data=data, seconds=clock.seconds, seed=seed, first=section)
+        page = report_run(
+            out, run=run, data=data, seconds=clock.seconds, seed=seed, first=section, device=device
+        )
     print(f"\nDone in {sum(clock.seconds.values()) / 60:.1f} minutes. Open {page} in a browser.")
     return page
 
 
-def _shipped_weights(out: Path, *, seed: int) -> list[str]:
+def _shipped_weights(out: Path, *, seed: int, device: torch.device) -> list[str]:
     """What the shipped weights answer, as a section of the report; also written as a page of its own at first.
 
     Pages to explore are written to out/shipped/.
@@ -111,7 +119,7 @@ def _shipped_weights(out: Path, *, seed: int) -> list[str]:
     if kept.exists():
         return json.loads(kept.read_text())
     try:
-        model, config, _ = open_run(PRETRAINED)
+        model, config, _ = open_run(PRETRAINED, device=device)
     except UserError as error:  # a checkout without them
         print(f"note: left out: {error}", file=sys.stderr)
         return []
@@ -130,13 +138,15 @@ def _shipped_weights(out: Path, *, seed: int) -> list[str]:
     for example, shape in zip(examples, unseen, strict=True):
         if shape.category in ("chair", "sofa"):
             front = render_folder(data, shape.id) / f"render_{example.chosen}.png"
-            links[f"an unseen {shape.category}"] = _explorer(out, shape.category, front, seed=seed)
+            links[f"an unseen {shape.category}"] = _explorer(
+                out, shape.category, front, seed=seed, device=device
+            )
     for path in sorted(_PHOTOGRAPHS.glob("*.png")):
         picture = read_pictures([path])
         clouds = predict(model, picture[0], _CODES, seed=seed)
         photographed.append(figures.Photographed(path.stem, picture, clouds, clouds[0]))
         if path.stem == "sedan":
-            links["the photograph of a car"] = _explorer(out, path.stem, path, seed=seed)
+            links["the photograph of a car"] = _explorer(out, path.stem, path, seed=seed, device=device)
     section = shipped_weights_section(examples, photographed, links)
     page = pages.page(
         "What the shipped weights answer", section, subtitle="A small network of its own is next."
@@ -153,9 +163,9 @@ def _shapes(data: Path, split: str) -> list[Shape]:
         return []
 
 
-def _explorer(out: Path, name: str, image: Path, *, seed: int) -> str:
+def _explorer(out: Path, name: str, image: Path, *, seed: int, device: torch.device) -> str:
     """Writes the page to explore an image; returns its address relative to the report."""
-    explore_to_file(PRETRAINED, [image], out / "shipped" / f"explore-{name}.html", seed=seed)
+    explore_to_file(PRETRAINED, [image], out / "shipped" / f"explore-{name}.html", seed=seed, device=device)
     return f"shipped/explore-{name}.html"
 
 

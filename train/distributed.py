@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 import diffpoint
+from train.device import CPU, prepare
 from train.errors import UserError
 
 if TYPE_CHECKING:
@@ -22,9 +23,16 @@ if TYPE_CHECKING:
 
 
 class World:
-    """A single process: collectives are no-ops, and its shard of a batch is the whole batch."""
+    """A single process: collectives are no-ops, and its shard of a batch is the whole batch.
+
+    Args:
+        device: on which this process trains.
+    """
 
     rank, size = 0, 1
+
+    def __init__(self, device: torch.device = CPU) -> None:
+        self.device = device
 
     @property
     def is_main(self) -> bool:
@@ -62,8 +70,11 @@ class Group(World):
     """Processes connected by Lightning Fabric."""
 
     def __init__(self, fabric: Fabric) -> None:
+        super().__init__(fabric.device)
         self._fabric = fabric
         self.rank, self.size = fabric.global_rank, fabric.world_size
+        # Flags of the programs must not wait for what their GPUs have in the queue.
+        self._programs = torch.distributed.new_group(backend="gloo") if self.device != CPU else None
 
     def average_gradients(self, network: nn.Module) -> None:
         """One message for all gradients. A parameter without a gradient has none in every process."""
@@ -80,7 +91,9 @@ class Group(World):
 
     def any(self, flag: bool) -> bool:
         """Is `flag` true in any process?"""
-        return bool(self.sum(torch.tensor(float(flag))) > 0)
+        flags = torch.tensor(float(flag))
+        torch.distributed.all_reduce(flags, group=self._programs)
+        return bool(flags > 0)
 
     def barrier(self) -> None:
         """Waits until all processes have reached this call."""
@@ -88,16 +101,17 @@ class Group(World):
 
 
 @functools.cache
-def connect() -> World:
-    """Connects the processes that torchrun started; every one of them must call it.
+def connect(device: torch.device = CPU) -> World:
+    """Connects the processes that torchrun started; every one of them must call it, with its own device of one type.
 
     The cores of a machine are divided among its processes, for torch and for the kernels.
 
     Raises:
         UserError: there are several processes, and Lightning Fabric is not installed.
     """
+    prepare(device)
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return SINGLE
+        return SINGLE if device == CPU else World(device)
     try:
         from lightning_fabric import Fabric  # a single process does not need it
     except ImportError:
@@ -108,6 +122,7 @@ def connect() -> World:
     threads = max(1, diffpoint.runtime_info().threads // here)
     torch.set_num_threads(threads)
     diffpoint.configure(threads=threads)
-    fabric = Fabric(accelerator="cpu", strategy="ddp", devices=here, num_nodes=machines)
+    # It connects GPUs through nccl, CPUs through gloo, and gives each process the GPU of its LOCAL_RANK.
+    fabric = Fabric(accelerator=device.type, strategy="ddp", devices=here, num_nodes=machines)
     fabric.launch()
     return Group(fabric)

@@ -27,6 +27,7 @@ def _search(
     i = tl.program_id(0) % tiles * QUERIES + tl.arange(0, QUERIES)
     n = tl.minimum(tl.load(a_lengths + row), size_a).to(tl.int32)
     m = tl.minimum(tl.load(b_lengths + row), size_b).to(tl.int32)
+    m = tl.where(tl.program_id(0) % tiles * QUERIES < n, m, 0)  # padding needs no search
     a += row * size_a * 3
     b += row * size_b * 3
     infinite = float("inf")

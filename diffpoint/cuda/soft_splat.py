@@ -10,6 +10,7 @@ import triton.language as tl
 from torch import Tensor
 
 from diffpoint import _checks
+from diffpoint._footprint import least_fade
 from diffpoint.cuda import errors
 from diffpoint.cuda.launch import bits_of, launch, real
 
@@ -21,7 +22,7 @@ _CANDIDATES = 32  # points at once there
 @triton.jit
 def _gather(
     pixels, point_depth, lengths, depth, coverage, nearest, weight, not_in_range,
-    views, count, height, width, radius_bits, softness_bits, SIDE: tl.constexpr, CANDIDATES: tl.constexpr,
+    views, count, height, width, radius_bits, softness_bits, least_bits, SIDE: tl.constexpr, CANDIDATES: tl.constexpr,
 ):  # fmt: skip
     """A square of pixels against all points of the view; candidates whose disc misses the square are passed over.
 
@@ -39,6 +40,7 @@ def _gather(
     infinite = float("inf")
     radius = real(radius_bits, dtype)
     softness = real(softness_bits, dtype)
+    least = real(least_bits, dtype)
     length = tl.load(lengths + view // views)
     if square == 0 and view % views == 0 and (length < 0 or length > count):
         tl.atomic_add(not_in_range, 1)
@@ -62,7 +64,7 @@ def _gather(
             du = (column[:, None].to(dtype) + 0.5 - tl.where(reaches, u, 0.0)[None, :]) / radius
             dv = (row[:, None].to(dtype) + 0.5 - tl.where(reaches, v, 0.0)[None, :]) / radius
             fade = 1.0 - du * du - dv * dv
-            hit = reaches[None, :] & (fade > 0.0)
+            hit = reaches[None, :] & (fade > least)
             footprint = tl.where(hit, fade * fade, 0.0)
             z = d[None, :]
             leads = hit & (z < front)
@@ -74,9 +76,9 @@ def _gather(
             weighted = weighted * kept + gained * z
             covered += footprint
             front = tl.where(leads, z, front)
-    least = tl.min(front, axis=1)
+    foremost = tl.min(front, axis=1)
     some = front < infinite
-    kept = tl.exp(-tl.where(some, front - tl.where(some, least[:, None], 0.0), 0.0) / softness)
+    kept = tl.exp(-tl.where(some, front - tl.where(some, foremost[:, None], 0.0), 0.0) / softness)
     kept = tl.where(some, kept, 0.0)
     sum_of_weights = tl.sum(total * kept, axis=1)
     sum_of_depths = tl.sum(weighted * kept, axis=1)
@@ -86,14 +88,14 @@ def _gather(
     at = view * height * width + row * width + column
     tl.store(depth + at, mean, mask=inside)
     tl.store(coverage + at, tl.sum(covered, axis=1), mask=inside)
-    tl.store(nearest + at, least, mask=inside)
+    tl.store(nearest + at, foremost, mask=inside)
     tl.store(weight + at, sum_of_weights, mask=inside)
 
 
 @triton.jit
 def _to_points(
     pixels, point_depth, lengths, depth, nearest, weight, grad_depth, grad_coverage, grad_pixels, grad_point_depth,
-    views, count, height, width, radius_bits, softness_bits, reach, POINTS: tl.constexpr,
+    views, count, height, width, radius_bits, softness_bits, least_bits, reach, POINTS: tl.constexpr,
 ):  # fmt: skip
     """Some points of a view gather from the pixels of their discs."""
     tiles = tl.cdiv(count, POINTS)
@@ -102,6 +104,7 @@ def _to_points(
     dtype: tl.constexpr = point_depth.dtype.element_ty
     radius = real(radius_bits, dtype)
     softness = real(softness_bits, dtype)
+    least = real(least_bits, dtype)
     at = view * count + i
     inside = (i < count) & (i < tl.load(lengths + view // views))
     u = tl.load(pixels + 2 * at, mask=inside, other=float("inf"))
@@ -122,7 +125,7 @@ def _to_points(
             du = (column.to(dtype) + 0.5 - u) / radius
             dv = (row.to(dtype) + 0.5 - v) / radius
             fade = 1.0 - du * du - dv * dv
-            hit = near & (row >= 0) & (row < height) & (column >= 0) & (column < width) & (fade > 0.0)
+            hit = near & (row >= 0) & (row < height) & (column >= 0) & (column < width) & (fade > least)
             p = view * height * width + row * width + column
             g = tl.load(grad_coverage + p, mask=hit, other=0.0)
             share = tl.exp(tl.where(hit, tl.load(nearest + p, mask=hit, other=0.0) - d, 0.0) / softness)
@@ -161,7 +164,8 @@ def soft_splat(
     inputs = pixels, point_depth, lengths, depth, coverage, nearest, weight
     not_in_range = errors.counter(point_depth, "soft_splat", "lengths", "length")
     programs = batch * views * triton.cdiv(height, _SIDE) * triton.cdiv(width, _SIDE)
-    sizes = views, count, height, width, bits_of(radius), bits_of(softness)
+    numbers = bits_of(radius), bits_of(softness), bits_of(least_fade(depth, radius))
+    sizes = views, count, height, width, *numbers
     launch(_gather, programs, *inputs, not_in_range, *sizes, _SIDE, _CANDIDATES)
     errors.settle(point_depth, lambda: _checks.check_lengths_range("soft_splat", "lengths", lengths, count))
     return depth, coverage, nearest, weight
@@ -184,7 +188,13 @@ def soft_splat_backward(
     grad_pixels, grad_point_depth = torch.zeros_like(pixels), torch.zeros_like(point_depth)
     if point_depth.numel() and depth.numel():
         inputs = pixels, point_depth, lengths, depth, nearest, weight, grad_depth, grad_coverage
-        sizes = views, count, *depth.shape[2:], bits_of(radius), bits_of(softness), math.floor(radius + 0.5)
+        numbers = (
+            bits_of(radius),
+            bits_of(softness),
+            bits_of(least_fade(depth, radius)),
+            math.floor(radius + 0.5),
+        )
+        sizes = views, count, *depth.shape[2:], *numbers
         programs = batch * views * triton.cdiv(count, _POINTS)
         launch(_to_points, programs, *inputs, grad_pixels, grad_point_depth, *sizes, _POINTS)
     return grad_pixels, grad_point_depth

@@ -20,7 +20,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from diffpoint import _auction, transport
+from diffpoint import _auction, _checks
 from diffpoint.cuda import errors
 from diffpoint.cuda.launch import bits_of, launch, real
 from diffpoint.cuda.values import count_bad_sets
@@ -577,10 +577,11 @@ def earth_mover_distance(
             cost, assignment, bound, finished, final_prices,
             a.new_empty((count, 4, width)), a_lengths.new_empty((count, 4, width), dtype=torch.int32),
             *(errors.counter(a, name, argument, kind) for argument, kind in counters),
-            size_a, size_b, width, bits_of(tolerance), bits_of(transport.RESOLUTION[a.dtype]), _auction.BIDS_PER_PERSON,
+            size_a, size_b, width,
+            bits_of(tolerance), bits_of(_auction.RESOLUTION[a.dtype.itemsize]), _auction.BIDS_PER_PERSON,
             warps=_WARPS, registers=_REGISTERS[a.dtype],
         )  # fmt: skip
-    errors.settle(a, lambda: transport.check_values(a, b, a_lengths, b_lengths, prices, known_cost))
+    errors.settle(a, lambda: _checks.check_transport(a, b, a_lengths, b_lengths, prices, known_cost))
     return cost, assignment, bound, finished.view(torch.bool), final_prices
 
 

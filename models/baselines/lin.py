@@ -195,4 +195,4 @@ def _some(mask: Tensor) -> Tensor:
 
 def _resample(cloud: Tensor, count: int) -> Tensor:
     """(n, 3) -> (count, 3): indices spaced evenly over the list, with omissions or repeats."""
-    return cloud[torch.arange(count) * len(cloud) // count]
+    return cloud[torch.arange(count, device=cloud.device) * len(cloud) // count]

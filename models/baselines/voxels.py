@@ -63,13 +63,14 @@ def _on_faces(occupied: Tensor, count: int) -> Tensor:
         [occupied & ~padded.roll(-step, axis)[inside] for axis in range(3) for step in (-1, 1)]
     )
     faces = exposed.nonzero()  # (Q, 4): direction, cell
-    number = torch.arange(count)
+    device = occupied.device
+    number = torch.arange(count, device=device)
     face = faces[number * len(faces) // count]
     axis, outward = face[:, 0] // 2, face[:, 0] % 2
-    places = (number[:, None] * torch.tensor(_EVEN_STEPS, dtype=torch.float64)) % 1
+    places = (number[:, None] * torch.tensor(_EVEN_STEPS, dtype=torch.float64, device=device)) % 1
     # Within the cell the coordinate along the face's normal is 0 or 1, the other two are places.
-    offset = torch.empty(count, 3)
-    across = torch.tensor([[1, 2], [0, 2], [0, 1]])[axis]
+    offset = torch.empty(count, 3, device=device)
+    across = torch.tensor([[1, 2], [0, 2], [0, 1]], device=device)[axis]
     offset.scatter_(1, across, places.float())
     offset.scatter_(1, axis[:, None], outward[:, None].float())
     return (face[:, 1:] + offset) / size - 0.5

@@ -39,7 +39,7 @@ def view_loss(case: Maps, name: str, function: Callable, **options) -> str:
     cloud, camera, depth, poisoned = case.make()
     loss_of = getattr(dp, name)
     nothing = len(depth) == 0 or case.views == 0
-    no_points = name == "front_constraint" and cloud.points.shape[1] == 0
+    no_points = name == "front_constraint" and cloud.points.shape[1] == 0 and len(depth) > 0
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="front_constraint: in ", category=RuntimeWarning)
         refuse_or_run(

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from train.device import moved
+
 # At strength 1; each is drawn uniformly up to these values in both directions, where a direction makes sense.
 _SHIFT = 0.03  # of the image's side
 _SCALE = 0.05
@@ -34,7 +36,8 @@ def augment(images: Tensor, strength: float, seeds: Tensor) -> Tensor:
     Args:
         images: (B, 3, H, W) in [0, 1] on white.
         strength: 0 changes nothing; 1 is as much as photographs need.
-        seeds: (B,) int64, one for each image: what happens to an image does not depend on those beside it.
+        seeds: (B,) int64 on the CPU, one for each image: what happens to an image does not depend on those beside it,
+            nor on the device, but for rounding.
 
     Returns:
         (B, 3, H, W) in [0, 1].
@@ -73,7 +76,7 @@ def _random_numbers(images: Tensor, seeds: Tensor) -> tuple[Tensor, Tensor]:
         generator = torch.Generator().manual_seed(seed)
         uniform.append(torch.rand(64, generator=generator))
         normal.append(torch.randn(images.shape[1:], generator=generator))
-    return torch.stack(uniform).to(images.device), torch.stack(normal).to(images.device)
+    return moved(torch.stack(uniform), images.device), moved(torch.stack(normal), images.device)
 
 
 def _move(images: Tensor, *, shift: Tensor, scale: Tensor, turn: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -25,13 +26,14 @@ from train.data.cache import prepare
 from train.data.packed import PackedShape, PackedViews
 from train.data.shrink import Pool, Sizes
 from train.data.tree import ShapeTree
+from train.device import CPU, moved, room_for_views
 from train.errors import UserError
 from train.files import as_paths
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LoadedSplit:
-    """M shapes with V views each.
+    """M shapes with V views each, on one device. Shape and view numbers are given on the CPU, where they are drawn.
 
     Attributes:
         images: M of (V, 3, h, w) uint8, packed or a tensor, at the network's input size.
@@ -60,16 +62,41 @@ class LoadedSplit:
         return self.images[0].shape[0]
 
     @property
+    def device(self) -> torch.device:
+        """On which batches are made."""
+        return self.points.device
+
+    def to(self, device: torch.device, *, room: float | None = None) -> LoadedSplit:
+        """The split on another device. All its views are decompressed and kept there, if there is room for them.
+
+        If there is not, they stay packed on the CPU, and those of a batch are decompressed and copied when it is made.
+
+        Args:
+            device: where batches shall be.
+            room: bytes that views may take on a GPU; by default 40 % of its free memory.
+        """
+        if device == self.device:
+            return self
+        moving = {name: getattr(self, name).to(device) for name in ("K", "cam_from_world", "points")}
+        packed = [name for name in ("images", "depth") if not isinstance(getattr(self, name), Tensor)]
+        room = room_for_views(device) if room is None else room
+        if device != CPU and sum(_unpacked_bytes(getattr(self, name)) for name in packed) <= room:
+            moving |= {name: _unpacked(getattr(self, name), device) for name in packed}
+        for name in {"images", "depth"} - set(packed):
+            moving[name] = getattr(self, name).to(device)
+        return dataclasses.replace(self, **moving)
+
+    @property
     def fingerprint(self) -> str:
         """Changes when shapes, views or ground truth change."""
         digest = hashlib.sha256("\n".join(self.ids).encode())
-        digest.update(np.ascontiguousarray(self.points[:, :8].numpy()).tobytes())
+        digest.update(np.ascontiguousarray(self.points[:, :8].cpu().numpy()).tobytes())
         digest.update(str((len(self), *self.images[0].shape)).encode())
         return digest.hexdigest()[:16]
 
     def float_images(self, shapes: Tensor, views: Tensor) -> Tensor:
         """(B,) shape and (B, V) view numbers -> (B, V, 3, h, w) images in [0, 1]."""
-        return _picked(self.images, shapes, views).float() / 255
+        return self._picked(self.images, shapes, views).float() / 255
 
     def batch(self, shapes: Tensor, views: Tensor) -> Batch:
         """(B,) shape and (B, V) view numbers -> a batch."""
@@ -79,22 +106,36 @@ class LoadedSplit:
     def targets(self, shapes: Tensor) -> Targets:
         """(B,) shape numbers -> their whole surfaces and all of their views."""
         depth, camera = self._depth_maps(shapes, torch.arange(self.views).expand(len(shapes), -1))
-        return Targets(self.points[shapes], depth, camera)
+        return Targets(self.points[moved(shapes, self.device)], depth, camera)
 
     def _depth_maps(self, shapes: Tensor, views: Tensor) -> tuple[Tensor, PinholeCamera]:
-        picked = (shapes[:, None], views)
+        picked = moved(shapes[:, None], self.device), moved(views, self.device)
         size = self.depth[0].shape[-1]
         camera = PinholeCamera(self.K[picked], self.cam_from_world[picked], size, size)
-        return _picked(self.depth, shapes, views), camera
+        return self._picked(self.depth, shapes, views), camera
 
     def clouds(self, shapes: Tensor, points: Tensor) -> Tensor:
         """(B,) shape and (B, N) point numbers -> (B, N, 3) of the ground truth."""
-        return self.points[shapes[:, None], points]
+        return self.points[moved(shapes[:, None], self.device), moved(points, self.device)]
+
+    def _picked(self, values: Sequence[PackedViews] | Tensor, shapes: Tensor, views: Tensor) -> Tensor:
+        """M of (V, ...), (B,) shape and (B, V') view numbers -> (B, V', ...)."""
+        if isinstance(values, Tensor):
+            return values[moved(shapes[:, None], self.device), moved(views, self.device)]
+        picked = [values[shape][chosen] for shape, chosen in zip(shapes.tolist(), views, strict=True)]
+        return moved(torch.stack(picked), self.device)
 
 
-def _picked(values: Sequence[PackedViews] | Tensor, shapes: Tensor, views: Tensor) -> Tensor:
-    """M of (V, ...), (B,) shape and (B, V') view numbers -> (B, V', ...)."""
-    return torch.stack([values[shape][chosen] for shape, chosen in zip(shapes.tolist(), views, strict=True)])
+def _unpacked_bytes(values: Sequence[PackedViews]) -> int:
+    return len(values) * math.prod(values[0].shape) * values[0].dtype.itemsize
+
+
+def _unpacked(values: Sequence[PackedViews], device: torch.device) -> Tensor:
+    """(M, V, ...)."""
+    found = torch.empty((len(values), *values[0].shape), dtype=values[0].dtype, device=device)
+    for into, packed in zip(found, values, strict=True):
+        into.copy_(packed[:])
+    return found
 
 
 class Targets(NamedTuple):

@@ -30,6 +30,7 @@ from torch import Tensor
 from models import Predictor
 from train.config import FitConfig
 from train.data.batches import LoadedSplit
+from train.device import CPU
 from train.errors import UserError
 from train.evaluation.metrics import cloud_errors, thin_out
 from train.evaluation.per_shape import (
@@ -63,6 +64,7 @@ def evaluate(
     limit: int | None = None,
     out: str | Path | None = None,
     progress: bool = True,
+    device: torch.device = CPU,
 ) -> dict[str, Any]:
     """Evaluates a run on a split and writes evaluation.json.
 
@@ -76,6 +78,7 @@ def evaluate(
         limit: evaluate at most this many shapes of the split.
         out: the file to write; RUN/evaluation.json by default.
         progress: show progress bars and print the table.
+        device: where everything is computed.
 
     Returns:
         What was written.
@@ -85,7 +88,7 @@ def evaluate(
     """
     begun = time.monotonic()
     _check(seeds, views, limit)
-    opened = open_run(run)
+    opened = open_run(run, device=device)
     model, config, folder = opened
     if out is None:
         if folder is None:

@@ -11,6 +11,7 @@ import torch
 from models import Predictor
 from train.config import FitConfig, fit_config_from_json
 from train.data import Shape, ShapeTree
+from train.device import CPU
 from train.errors import UserError
 from train.evaluation.inference import predict, reconstruct
 from train.evaluation.runs import load_predictor, read_metrics
@@ -29,6 +30,7 @@ def report_run(
     seconds: Mapping[str, float] | None = None,
     seed: int = 0,
     first: Sequence[str] = (),
+    device: torch.device = CPU,
 ) -> Path:
     """Writes out/report.html and out/figures/*.png about an evaluated run.
 
@@ -39,6 +41,7 @@ def report_run(
         seconds: duration of each phase, for the record.
         seed: of the examples' random codes.
         first: parts of the page that precede those about the run.
+        device: where the predictions are computed.
 
     Returns:
         The page.
@@ -53,7 +56,7 @@ def report_run(
         )
     config = (run / "config.json").read_text()
     settings = fit_config_from_json(config, where=str(run / "config.json"))
-    model, shapes = load_predictor(run), pick_shapes(ShapeTree(data, "test"))
+    model, shapes = load_predictor(run, device=device), pick_shapes(ShapeTree(data, "test"))
     return write_report(
         out,
         result=json.loads((run / "evaluation.json").read_text()),

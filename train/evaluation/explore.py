@@ -40,7 +40,7 @@ def explore(
 
     Args:
         model: a network for which `not_explorable` is None.
-        images: (V, 3, H, W) in [0, 1].
+        images: (V, 3, H, W) in [0, 1], on the CPU as the codes and the result are.
         codes: (V, D) a typical code for each, for example those on which `reconstruct` found the images to agree.
         seed: of the random codes.
         progress: show a progress bar.
@@ -51,7 +51,7 @@ def explore(
     found = []
     pairs = list(zip(images, codes, strict=True))
     for image, code in progress_bar(pairs, title="plane of codes", unit="image", progress=progress):
-        features = model.encode(image[None])
+        features = model.encode(image[None].to(model.device))
         clouds = _decode(model, features, drawn)
         directions = directions_of_change(drawn, clouds)
         start = directions @ code
@@ -79,6 +79,7 @@ def directions_of_change(codes: Tensor, clouds: Tensor) -> Tensor:
 
 
 def _decode(model: Predictor, features: Tensor, codes: Tensor) -> Tensor:
-    """Features of one image and (R, D) codes -> (R, N, 3)."""
+    """Features of one image and (R, D) codes on the CPU -> (R, N, 3), there too."""
     at_once = max(1, _POINTS_AT_ONCE // model.points)
-    return torch.cat([model.decode(features, some[:, None])[:, 0] for some in codes.split(at_once)])
+    codes = codes.to(features.device)
+    return torch.cat([model.decode(features, some[:, None])[:, 0] for some in codes.split(at_once)]).cpu()

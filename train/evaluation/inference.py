@@ -14,6 +14,7 @@ from torch import Tensor
 from diffpoint import chamfer_distance, consistency_loss
 from models import Predictor
 from train.config import InferenceConfig
+from train.device import moved
 
 # Predicted points of the objects that are processed together: 16 objects with 24 views at the cpu profile, 4 at the
 # full one. This keeps the memory of a gradient step near a gigabyte.
@@ -53,8 +54,9 @@ def reconstruct(
     `settings.medoid` that nearest to those of all codes.
 
     Args:
-        model: the network; its parameters are not changed. One without codes predicts once.
-        images: (V, 3, H, W) of one object, or (B, V, 3, H, W) of B objects, in [0, 1] on white.
+        model: the network, on any device; its parameters are not changed. One without codes predicts once.
+        images: (V, 3, H, W) of one object, or (B, V, 3, H, W) of B objects, in [0, 1] on white. The result is on their
+            device; codes are drawn on the CPU, the same for every device.
         groups: number of groups of V random codes per object; by default that of `settings`, or 5.
         steps: gradient steps on the kept codes; by default those of `settings`, or 30.
         seed: of the random codes.
@@ -86,6 +88,7 @@ def reconstruct(
     shapes, views = images.shape[:2]
     generator = torch.Generator().manual_seed(seed)
     candidates = torch.randn(settings.groups, shapes, views, model.code_dim, generator=generator)
+    home, images, candidates = images.device, moved(images, model.device), moved(candidates, model.device)
     at_once = max(1, _POINTS_AT_ONCE // (views * model.points))
     parts = [
         _reconstruct(model, some_images, some_candidates, settings)
@@ -96,14 +99,21 @@ def reconstruct(
     points, codes, histories, kept = zip(*parts, strict=True)
     rows = max(len(history) for history in histories)
     history = torch.cat([_extend(history, rows) for history in histories], dim=1)
-    return Reconstruction(torch.cat(points), torch.cat(codes), history, torch.cat(kept))
+    return Reconstruction(
+        *(of.to(home) for of in (torch.cat(points), torch.cat(codes), history, torch.cat(kept)))
+    )
 
 
 @torch.no_grad()
+def predict_images(model: Predictor, images: Tensor, codes: Tensor) -> Tensor:
+    """(R, B, N, 3) on the device of images (B, 3, H, W): a network's predictions with codes (R, B, D) on any device."""
+    return model(moved(images, model.device), moved(codes, model.device)).to(images.device)
+
+
 def predict(model: Predictor, image: Tensor, count: int, *, seed: int) -> Tensor:
     """(R, N, 3): a network's predictions for one image (3, H, W) with `count` random codes."""
     codes = torch.randn(count, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
-    return model(image[None], codes)[:, 0].contiguous()
+    return predict_images(model, image[None], codes)[:, 0].contiguous()
 
 
 def _check(settings: InferenceConfig) -> None:
@@ -124,7 +134,9 @@ def _reconstruct(
 ) -> Reconstruction:
     """(B, V, 3, H, W) images and (G, B, V, D) candidate codes, all in memory at once."""
     shapes, views = images.shape[:2]
-    no_descent = torch.zeros(0, shapes), torch.zeros(shapes, dtype=torch.int64)
+    device = images.device
+    numbers = torch.arange(shapes, device=device)
+    no_descent = torch.zeros(0, shapes, device=device), torch.zeros(shapes, dtype=torch.int64, device=device)
     chooses = model.takes_codes and (views > 1 or (settings.medoid and settings.groups > 1))
     if not chooses:
         points = model.predict_views(images, candidates[0]).flatten(1, 2)
@@ -136,20 +148,20 @@ def _reconstruct(
             clouds = torch.cat(
                 [_decode(model, features, group) for group in candidates], dim=1
             )  # (B, G, N, 3)
-            chosen = _medoid(clouds), torch.arange(shapes)
+            chosen = _medoid(clouds), numbers
             return Reconstruction(clouds.transpose(0, 1)[chosen], candidates[chosen], *no_descent)
         if settings.groups > 1:
             scores = [
                 consistency_loss(_decode(model, features, group), reduction="none") for group in candidates
             ]
-            codes = candidates[torch.stack(scores).argmin(0), torch.arange(shapes)]
+            codes = candidates[torch.stack(scores).argmin(0), numbers]
     return _descend(model, features, codes, settings)
 
 
 def _medoid(clouds: Tensor) -> Tensor:
     """(B, G, N, 3) -> (B,) which of the G clouds of each shape has the least mean chamfer distance to the others."""
     by_number = clouds.transpose(0, 1).contiguous()
-    distances = torch.zeros(len(by_number), *by_number.shape[:2])
+    distances = by_number.new_zeros(len(by_number), *by_number.shape[:2])
     for other in range(1, len(by_number)):
         among = by_number[:other]
         pair = chamfer_distance(among, by_number[other].expand_as(among), squared=False)
@@ -172,11 +184,11 @@ def _descend(model: Predictor, features: Tensor, codes: Tensor, settings: Infere
         points=codes.new_zeros(shapes, views, model.points, 3),
         codes=codes.clone(),
         history=codes.new_zeros(settings.steps + 1, shapes),
-        kept=torch.zeros(shapes, dtype=torch.int64),
+        kept=torch.zeros(shapes, dtype=torch.int64, device=codes.device),
     )
     lowest = codes.new_full((shapes,), torch.inf)
-    waited = torch.zeros(shapes, dtype=torch.int64)
-    active = torch.arange(shapes)  # shapes whose descent has not stopped
+    waited = torch.zeros_like(found.kept)
+    active = torch.arange(shapes, device=codes.device)  # shapes whose descent has not stopped
     for step in range(settings.steps + 1):
         last = step == settings.steps
         moving = codes[active].requires_grad_(not last)

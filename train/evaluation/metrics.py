@@ -98,7 +98,7 @@ def in_silhouette(points: Tensor, camera: PinholeCamera, depth: Tensor, *, margi
     """
     silhouette = F.max_pool2d(torch.isfinite(depth).float(), 2 * margin + 1, 1, margin) > 0
     pixels = project(points, camera).pixels
-    size = torch.tensor([camera.width, camera.height])
+    size = torch.tensor([camera.width, camera.height], device=pixels.device)
     inside = ((pixels >= 0) & (pixels < size)).all(-1)
-    u, v = pixels.long().clamp(torch.zeros(2, dtype=torch.long), size - 1).unbind(-1)
+    u, v = pixels.long().clamp(torch.zeros_like(size), size - 1).unbind(-1)
     return inside & silhouette.flatten(2).gather(2, v * camera.width + u)

@@ -11,7 +11,7 @@ from diffpoint import chamfer_distance, consistency_loss
 from models import Predictor
 from train.config import InferenceConfig
 from train.data.batches import Batch, LoadedSplit
-from train.evaluation.inference import reconstruct
+from train.evaluation.inference import predict_images, reconstruct
 from train.evaluation.metrics import cloud_errors, thin_out, transport_error
 
 METRICS = (
@@ -57,10 +57,11 @@ def evaluate_split(
         done: called with the number of shapes that have just been evaluated.
 
     Returns:
-        The metrics of `METRICS`; "code_norm", the mean norm of the codes; and after a search "searched", the
+        On the CPU: the metrics of `METRICS`; "code_norm", the mean norm of the codes; after a search "searched", the
         consistency loss x100 before the descent.
     """
     parts: list[ShapeMetrics] = []
+    test = test.to(model.device)
     order = view_order(test, seed)
     draw = seed if code_seed is None else code_seed
     for start in range(0, len(test), SHAPES_AT_ONCE):
@@ -82,7 +83,7 @@ def evaluate_split(
             metrics["consistency"] = 100 * consistency_loss(by_view, reduction="none")
         parts.append(metrics)
         done(len(shapes))
-    return concatenate(parts)
+    return on_cpu(concatenate(parts))
 
 
 def compare_clouds(predicted: Tensor, target: Tensor, *, points: int) -> ShapeMetrics:
@@ -120,12 +121,13 @@ def sample_predictions(
         seed: of the choice of views and of the codes.
 
     Yields:
-        (B,) indices of shapes, their batch with the one input view, and (R, B, N, 3) predictions in the world frame.
+        (B,) indices of shapes on the CPU; and on the network's device their batch with the one input view, and
+        (R, B, N, 3) predictions in the world frame.
     """
     generator = torch.Generator().manual_seed(seed)
-    for shapes, shown in one_view_each(test, seed):
+    for shapes, shown in one_view_each(test.to(model.device), seed):
         drawn = torch.randn(codes, len(shapes), model.code_dim, generator=generator)
-        yield shapes, shown, model(shown.images[:, 0], drawn).contiguous()
+        yield shapes, shown, predict_images(model, shown.images[:, 0], drawn).contiguous()
 
 
 def one_view_each(test: LoadedSplit, seed: int) -> Iterator[tuple[Tensor, Batch]]:
@@ -135,15 +137,15 @@ def one_view_each(test: LoadedSplit, seed: int) -> Iterator[tuple[Tensor, Batch]
         yield shapes, test.batch(shapes, first[shapes])
 
 
-def pairwise_distance(predictions: Tensor) -> Tensor:
+def pairwise_distance(clouds: Tensor) -> Tensor:
     """(R, B, N, 3) several predictions from each image -> (B,) mean chamfer distance x100 over all pairs of them."""
-    return 100 * consistency_loss(predictions.transpose(0, 1), reduction="none")
+    return 100 * consistency_loss(clouds.transpose(0, 1), reduction="none")
 
 
 def diversity(model: Predictor, test: LoadedSplit, *, codes: int, seed: int) -> Tensor:
-    """(M,) `pairwise_distance` of the predictions from one image of each shape with `codes` random codes."""
+    """(M,) on the CPU: `pairwise_distance` of the predictions from one image of each shape with random codes."""
     sampled = sample_predictions(model, test, codes=codes, seed=seed)
-    return torch.cat([pairwise_distance(predictions) for _, _, predictions in sampled])
+    return torch.cat([pairwise_distance(clouds) for _, _, clouds in sampled]).cpu()
 
 
 def distance_to_nearest(clouds: Tensor, among: Tensor) -> Tensor:
@@ -165,6 +167,11 @@ def view_order(test: LoadedSplit, seed: int) -> Tensor:
 def concatenate(parts: Sequence[ShapeMetrics]) -> ShapeMetrics:
     """Joins the metrics of several groups of shapes, (M,), or of seeds, (S, M), along the first axis."""
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def on_cpu(metrics: ShapeMetrics) -> ShapeMetrics:
+    """The same metrics on the CPU."""
+    return {name: values.cpu() for name, values in metrics.items()}
 
 
 def stack_seeds(by_seed: Sequence[ShapeMetrics]) -> ShapeMetrics:

@@ -13,6 +13,7 @@ from diffpoint.io import write_points
 from train.data.cutout import cut_out
 from train.data.images import PICTURE_SUFFIXES, is_cut_out, read_images, read_rgba
 from train.data.layouts import pictures_of
+from train.device import CPU
 from train.errors import UserError
 from train.evaluation.explore import explore, not_explorable
 from train.evaluation.inference import reconstruct
@@ -31,6 +32,7 @@ def reconstruct_to_files(
     groups: int | None = None,
     steps: int | None = None,
     seed: int = 0,
+    device: torch.device = CPU,
 ) -> None:
     """Reconstructs one object and writes reconstruction.ply, reconstruction.html and explore.html into `out`.
 
@@ -43,6 +45,7 @@ def reconstruct_to_files(
         groups: groups of random codes in the search; by default the run's setting.
         steps: gradient steps on the codes; by default the run's setting.
         seed: of the random codes.
+        device: where the predictions are computed.
 
     Raises:
         UserError: not a run, not an image, or a number out of range.
@@ -56,7 +59,7 @@ def reconstruct_to_files(
     if (groups is not None and groups < 1) or (steps is not None and steps < 0):
         raise UserError(f"--groups must be at least 1 and --steps at least 0; got {groups} and {steps}")
     pictures = read_pictures(images)
-    model, config, _ = open_run(run)
+    model, config, _ = open_run(run, device=device)
     found = reconstruct(model, pictures, groups=groups, steps=steps, seed=seed, settings=config.inference)
     points = found.points[0]
     answers = None if not_explorable(model) else explore(model, pictures, found.codes[0], seed=seed)
@@ -77,7 +80,14 @@ def reconstruct_to_files(
     print(f"wrote {', '.join(map(str, written))}: {made}")
 
 
-def explore_to_file(run: str | Path, images: Sequence[str | Path], out: str | Path, *, seed: int = 0) -> None:
+def explore_to_file(
+    run: str | Path,
+    images: Sequence[str | Path],
+    out: str | Path,
+    *,
+    seed: int = 0,
+    device: torch.device = CPU,
+) -> None:
     """Writes a page on which one drags through the codes of each image of an object; see `train.show.explorer`.
 
     Args:
@@ -85,6 +95,7 @@ def explore_to_file(run: str | Path, images: Sequence[str | Path], out: str | Pa
         images: 1 to 24 images of the object, or folders of them.
         out: the .html file.
         seed: of the random codes.
+        device: where the predictions are computed.
 
     Raises:
         UserError: not a run, one whose predictions do not depend on a code, not an image, or `out` is a directory.
@@ -94,7 +105,7 @@ def explore_to_file(run: str | Path, images: Sequence[str | Path], out: str | Pa
     if out.is_dir():
         raise UserError(f"{out} is a directory; --out names a file, for example {out / 'page.html'}")
     pictures = read_pictures(images)
-    model, config, _ = open_run(run)
+    model, config, _ = open_run(run, device=device)
     obstacle = not_explorable(model)
     if obstacle:
         raise UserError(f"{run} cannot be explored: {obstacle}")

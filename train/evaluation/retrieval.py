@@ -27,7 +27,7 @@ def medoid(points: Tensor) -> int:
     if len(points) > _MEDOID_SHAPES:
         index = torch.linspace(0, len(points) - 1, _MEDOID_SHAPES).long()
     thin = points[index, ::stride].contiguous()
-    totals = torch.zeros(len(index))
+    totals = thin.new_zeros(len(index))
     for row in range(len(index)):
         distance = chamfer_distance(thin[row].expand_as(thin).contiguous(), thin, squared=False)
         totals[row] = (distance.a_to_b + distance.b_to_a).sum()
@@ -43,19 +43,20 @@ def nearest_by_image(test: LoadedSplit, train: LoadedSplit, *, views: Sequence[i
     Returns:
         For each n of `views`, (M_test,) indices of training shapes; of equally near ones the first.
     """
+    device = train.device
     smallest = {n: torch.full((len(test),), torch.inf) for n in views}
     nearest = {n: torch.zeros(len(test), dtype=torch.int64) for n in views}
     chunk = max(1, _CHUNK_BYTES // (4 * math.prod(train.images[0].shape)))
     for first in range(0, len(train), chunk):
         shapes = range(first, min(first + chunk, len(train)))
-        known = torch.cat([train.images[shape][:] for shape in shapes]).flatten(1).float() / 255
+        known = torch.cat([train.images[shape][:] for shape in shapes]).to(device).flatten(1).float() / 255
         known_squared = known.square().sum(1)
         for row, images in enumerate(test.images):
-            seen = images[:].flatten(1).float() / 255
+            seen = images[:].to(device).flatten(1).float() / 255
             squared = seen.square().sum(1)[:, None] + known_squared - 2 * seen @ known.T
             distance = squared.clamp(min=0).sqrt().unflatten(1, (len(shapes), -1)).amin(2)
             for n in views:
-                least, which = distance[:n].sum(0).min(0)
+                least, which = (each.cpu() for each in distance[:n].sum(0).min(0))
                 if least < smallest[n][row]:
                     smallest[n][row], nearest[n][row] = least, first + which
     return nearest

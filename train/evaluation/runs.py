@@ -7,9 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import torch
+
 from models import Autoencoder, Generator, Predictor
 from train.config import FitConfig, fit_config_from_json
 from train.data.batches import LoadedSplit, load_split
+from train.device import CPU
 from train.errors import UserError
 from train.methods.weights import method_of, predictor_classes, read_weights, save_weights
 
@@ -36,9 +39,10 @@ class OpenRun(NamedTuple):
         limit: int | None = None,
         progress: bool = True,
     ) -> LoadedSplit:
-        """Loads a split with the run's image size, map size and categories."""
+        """Loads a split with the run's image size, map size and categories, onto the network's device."""
         size = (self.model.config.image_height, self.model.config.image_width)
-        return read_split(self.config, data, split, image_size=size, limit=limit, progress=progress)
+        found = read_split(self.config, data, split, image_size=size, limit=limit, progress=progress)
+        return found.to(self.model.device)
 
 
 def read_split(
@@ -63,17 +67,18 @@ def read_split(
     )
 
 
-def open_run(run: str | Path) -> OpenRun:
+def open_run(run: str | Path, *, device: torch.device = CPU) -> OpenRun:
     """Loads the network of a run with its configuration.
 
     Args:
         run: a run's directory, a .safetensors file of one, or "pretrained".
+        device: on which the network shall be.
 
     Raises:
         UserError: no such run, or it cannot be read.
     """
     path = Path(run)
-    model = load_predictor(path)
+    model = load_predictor(path, device=device)
     if _is_shipped(path):
         return OpenRun(model, config_of(_SHIPPED, model), None)
     return OpenRun(model, config_of(path, model), path if path.is_dir() else path.parent)
@@ -85,11 +90,13 @@ def best_weights(run: str | Path, phase: int | str) -> Path:
     return Path(run) / "checkpoints" / f"best-{name}.safetensors"
 
 
-def load_generator(run_or_file: str | Path) -> Generator:
+def load_generator(run_or_file: str | Path, *, device: torch.device | str = CPU) -> Generator:
     """Loads the generator of a run (best weights of stage 2, else of stage 1, else the newest checkpoint).
 
     Args:
         run_or_file: a run's directory, a .safetensors file of one, or "pretrained".
+        device: where it shall be, as `torch.nn.Module.to` takes it, whatever device it was trained on. `reconstruct`
+            takes images on any device, then.
 
     Returns:
         The generator in eval mode.
@@ -97,12 +104,12 @@ def load_generator(run_or_file: str | Path) -> Generator:
     Raises:
         UserError: no such run, one of a baseline, or it cannot be read.
     """
-    return read_weights(_weights_file(Path(run_or_file)), Generator).eval()
+    return read_weights(_weights_file(Path(run_or_file)), Generator).eval().to(device)
 
 
-def load_predictor(run_or_file: str | Path) -> Predictor:
+def load_predictor(run_or_file: str | Path, *, device: torch.device | str = CPU) -> Predictor:
     """As `load_generator`, for the network of any system."""
-    return read_weights(_weights_file(Path(run_or_file)), *predictor_classes()).eval()
+    return read_weights(_weights_file(Path(run_or_file)), *predictor_classes()).eval().to(device)
 
 
 def load_autoencoder(run_or_file: str | Path) -> Autoencoder:

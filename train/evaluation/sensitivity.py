@@ -13,6 +13,7 @@ from torch import Tensor
 
 from diffpoint import chamfer_distance
 from models import Predictor
+from train.device import moved
 
 
 class Sensitivity(NamedTuple):
@@ -42,8 +43,8 @@ def sensitivity(model: Predictor, images: Tensor, *, seed: int = 0) -> Sensitivi
     if len(images) < 2:
         raise ValueError(f"sensitivity: needs at least 2 images, got {len(images)}")
     codes = torch.randn(2, 1, model.code_dim, generator=torch.Generator().manual_seed(seed))
-    features = model.encode(images)
-    clouds = model.decode(features, codes.expand(2, len(images), -1))
+    features = model.encode(moved(images, model.device))
+    clouds = model.decode(features, moved(codes.expand(2, len(images), -1), model.device))
     return Sensitivity(
         image=_mean_cd100(clouds[0], clouds[0].roll(1, 0)),
         code=_mean_cd100(clouds[0], clouds[1]),

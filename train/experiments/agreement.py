@@ -131,12 +131,14 @@ agreement = Experiment(
 
 def _measured(study: Study, run: Path, what: _Measurement) -> Metrics:
     """Metric -> (C, M) for each draw of codes and each shape, measured now or kept."""
-    opened = open_run(run)
+    opened = open_run(run, device=study.device)
     test = study.split(opened.config, "test")
     settings, views, seed, code_seeds = what
 
     def measure() -> Metrics:
-        evaluate = functools.partial(evaluate_split, opened.model, test, settings, views=views, seed=seed)
+        evaluate = functools.partial(
+            evaluate_split, opened.model, study.on_device(test), settings, views=views, seed=seed
+        )
         return stack_seeds([evaluate(code_seed=draw) for draw in code_seeds])
 
     # The name of a run is not enough: any run can be given, and one that trains on gets other weights.

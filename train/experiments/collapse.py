@@ -23,6 +23,7 @@ from models import Generator
 from models.parts import IMAGE_GAIN, IMAGE_MEAN
 from train.config import FitConfig
 from train.data.batches import LoadedSplit
+from train.distributed import SINGLE, World
 from train.errors import UserError
 from train.evaluation.runs import read_split
 from train.evaluation.sensitivity import sensitivity
@@ -141,23 +142,29 @@ def _trainings(study: Study) -> list[_Training]:
 
 def _curve(study: Study, path: Path, root: Path, variant: str, config: FitConfig) -> Curve:
     """The measurements of one training, made now or kept."""
-    size = get_method(config.system).image_size(config)
+    size, shapes = get_method(config.system).image_size(config), config.validation_shapes
     read = functools.partial(read_split, config, root, image_size=size, progress=False)
     key = [variant, dataclasses.replace(study, data=(root,)).run_of(config).name]
 
     def train() -> Curve:
-        return _train(config, VARIANTS[variant], read("train"), read("val", limit=config.validation_shapes))
+        data, val = (found.to(study.device) for found in (read("train"), read("val", limit=shapes)))
+        return _train(config, VARIANTS[variant], data, val, World(study.device))
 
     return kept(path, key, train)
 
 
-def _train(config: FitConfig, variant: Variant, train: LoadedSplit, val: LoadedSplit) -> Curve:
+def _train(
+    config: FitConfig, variant: Variant, train: LoadedSplit, val: LoadedSplit, world: World = SINGLE
+) -> Curve:
     """Trains stage 1 step by step, from the variant's network."""
-    trainer = Trainer(config, train)
+    trainer = Trainer(config, train, world)
     generator = trainer.state.network
     assert isinstance(generator, Generator)
+    generator.cpu()  # random weights are drawn there
     for change in variant.network:
         change(generator)
+    generator.to(trainer.device)
+    trainer.enter_phase(trainer.phase_name)  # with an optimiser of these weights
     shapes = torch.arange(min(_IMAGES, len(val)))
     images = val.float_images(shapes, torch.zeros(len(shapes), 1, dtype=torch.long))[:, 0]
     found: Curve = []
@@ -165,6 +172,7 @@ def _train(config: FitConfig, variant: Variant, train: LoadedSplit, val: LoadedS
     while not trainer.done:
         try:
             report = trainer.train_step()
+            trainer.checks.settle()
         except UserError:  # the loss is no longer finite: that is a result too
             found.append({"step": trainer.step, "image": math.nan, "code": math.nan, "dead_share": math.nan})
             break

@@ -101,7 +101,7 @@ def configs(study: Study) -> list[FitConfig]:
 def _networks(study: Study) -> dict[str, tuple[list[_Network], tuple[int, ...]]]:
     """Row -> networks and numbers of codes: of the study's trainings, or of a given run with as many draws of codes."""
     if study.run:
-        opened = open_run(study.run)
+        opened = open_run(study.run, device=study.device)
         key = ["run", weights_digest(opened.model)]
         codes = CODES if opened.model.takes_codes else (1,)
         draws = [_Network(key, lambda: opened.model, seed) for seed in range(study.seeds)]

@@ -24,7 +24,7 @@ from train.data.ambiguity_check import ambiguous_object
 from train.data.categories import SYNSET_OF
 from train.data.render import orbit_camera
 from train.errors import UserError
-from train.evaluation.inference import reconstruct
+from train.evaluation.inference import predict_images, reconstruct
 from train.evaluation.metrics import cloud_errors
 from train.experiments.frame import Experiment, Outcome
 from train.experiments.one_armed_chairs import RULES, SEED, Arms, OneArmedChair, make_chair, one_armed_chairs
@@ -160,8 +160,7 @@ def _predict(study: Study, config: FitConfig, chairs: list[OneArmedChair], size:
         points = reconstruct(model, images, seed=config.seed, settings=config.inference).points
         found[arms] = points.unflatten(1, (2, -1)).contiguous()
         if model.takes_codes:
-            with torch.no_grad():
-                found[f"{arms}, codes"] = model(images[:, 0], codes).transpose(0, 1).contiguous()
+            found[f"{arms}, codes"] = predict_images(model, images[:, 0], codes).transpose(0, 1).contiguous()
     return found
 
 

@@ -31,8 +31,9 @@ from train.config import (
     with_steps,
 )
 from train.data.batches import LoadedSplit
+from train.device import CPU, prepare
 from train.errors import UserError
-from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate, evaluate_split
+from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate, evaluate_split, on_cpu
 from train.evaluation.retrieval import medoid, nearest_by_image
 from train.evaluation.runs import best_weights, load_predictor, read_split
 from train.experiments import store
@@ -86,6 +87,8 @@ class Study:
     """For agreement, views per shape."""
     recipe: Recipe = "paper"
     """How our method is trained; other methods have one recipe each."""
+    device: torch.device = CPU
+    """Where networks are trained and measured. Splits that are not only measured, and all metrics, are on the CPU."""
     measures: bool = True
     """False: `NotMeasured` is raised instead of measuring anything."""
     _splits: dict[tuple, LoadedSplit] = dataclasses.field(default_factory=dict, repr=False, compare=False)
@@ -142,6 +145,15 @@ class Study:
             )
         return self._splits[key]
 
+    def on_device(self, split: LoadedSplit) -> LoadedSplit:
+        """One of this study's splits on its device, moved there once."""
+        if self.device == CPU:
+            return split
+        (key,) = (("moved", *key) for key, found in self._splits.items() if found is split)
+        if key not in self._splits:
+            self._splits[key] = split.to(self.device)
+        return self._splits[key]
+
     # Trainings
 
     def run_key(self, config: FitConfig) -> dict[str, Any]:
@@ -181,7 +193,7 @@ class Study:
         if begun:
             config = fit_config_from_json(saved.read_text(), where=str(saved))
         begin = time.process_time()  # wall-clock time would include what else the machine does
-        if not fit(self.data, run, config, resume=begun, progress=self.progress):
+        if not fit(self.data, run, config, resume=begun, progress=self.progress, device=self.device):
             raise KeyboardInterrupt
         seconds = round(time.process_time() - begin)
         write_text(run / "trained.json", json.dumps({"seconds": seconds, "continued": begun}) + "\n")
@@ -211,9 +223,10 @@ class Study:
         """
         if stage == 0:
             torch.manual_seed(config.seed)
-            return get_method(config.system).build(config)
+            return get_method(config.system).build(config).to(self.device)
         run = self.train(config, stage=stage)
-        return load_predictor(best_weights(run, stage) if f"stage{stage}" in config.phases else run)
+        weights = best_weights(run, stage) if f"stage{stage}" in config.phases else run
+        return load_predictor(weights, device=self.device)
 
     # Measurements
 
@@ -223,7 +236,7 @@ class Study:
 
     def kept(self, key: Sequence[object], measure: Callable[[], Metrics]) -> Metrics:
         """The metrics under a key of plain JSON values, measured now if they are not kept; see `store.kept`."""
-        return store.kept(self.out, key, measure if self.measures else None)
+        return store.kept(self.out, key, (lambda: on_cpu(measure())) if self.measures else None)
 
     def measure(
         self,
@@ -239,14 +252,14 @@ class Study:
         Args:
             config: whose network.
             what: everything else that decides the outcome, as plain JSON values.
-            function: makes the measurement.
+            function: makes the measurement, of a network and a split on the study's device.
             stage: see `network`.
             split: of the first tree; of the training shapes a hundred, evenly spread.
         """
         data = self.split(config, split, limit=_SOME_TRAINING_SHAPES if split == "train" else None)
         run = self.weights_key(stage1_of(config) if stage == 1 else config)
         key = [*run, stage, what, split, data.fingerprint]
-        return self.kept(key, lambda: function(self.network(config, stage=stage), data))
+        return self.kept(key, lambda: function(self.network(config, stage=stage), self.on_device(data)))
 
     def reconstruction_metrics(
         self,
@@ -382,6 +395,7 @@ def parts_of(config: FitConfig) -> tuple[FitConfig, ...]:
 
 
 def _call(function: Callable[..., object], study: Study, *given: Any) -> None:
+    prepare(study.device)
     function(study, *given)  # the result is on disk, and need not be sent back
 
 

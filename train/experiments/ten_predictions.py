@@ -68,7 +68,7 @@ def ten_predictions(row: Row, study: Study, config: FitConfig) -> Metrics:
         return study.measure(config, what, of_network, stage=row.stage)
 
     def distances(source: Source, test: LoadedSplit) -> Metrics:
-        real = train.points[some, :points]
+        real = train.points[some, :points].to(test.device)
         predictions = source(test, _PREDICTIONS)
         return concatenate([_distances(shown, clouds, real=real) for _, shown, clouds in predictions])
 
@@ -79,7 +79,7 @@ def ten_predictions(row: Row, study: Study, config: FitConfig) -> Metrics:
     trained_on = study.split(config, "train", limit=_TRAINED_ON)
 
     def critic(source: Source, test: LoadedSplit) -> Metrics:
-        encode = load_autoencoder(study.train(of_critic)).encode_frozen
+        encode = load_autoencoder(study.train(of_critic)).to(test.device).encode_frozen
         return below_real_shapes(
             source, test, trained_on=trained_on, encode=encode, points=points, seed=config.seed, steps=steps
         )
@@ -152,7 +152,7 @@ def below_real_shapes(
     """
 
     def codes(clouds: Tensor) -> Tensor:
-        return encode(clouds.flatten(0, 1).contiguous()).unflatten(0, clouds.shape[:2])
+        return encode(clouds.flatten(0, 1).contiguous().to(test.device)).unflatten(0, clouds.shape[:2])
 
     def real_and_predicted(split: LoadedSplit, count: int) -> tuple[Tensor, Tensor]:
         """Codes (R, M, D) of samples of a split's shapes, and of predictions."""
@@ -181,11 +181,11 @@ def train_critic(real: Tensor, fake: Tensor, *, seed: int, steps: int) -> Critic
     random = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        critic = Critic()
+        critic = Critic().to(real.device)
     optimiser = torch.optim.Adam(critic.parameters(), lr=_LEARNING_RATE)
     for _ in range(steps):
         batches = [each[torch.randint(len(each), (_BATCH,), generator=random)] for each in (real, fake)]
-        penalty = gradient_penalty(critic, *batches, mix=torch.rand(_BATCH, generator=random))
+        penalty = gradient_penalty(critic, *batches, mix=torch.rand(_BATCH, generator=random).to(real.device))
         loss = critic_loss(*map(critic, batches)) + StageConfig.penalty * penalty
         optimiser.zero_grad(set_to_none=True)
         loss.backward()

@@ -14,9 +14,11 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from diffpoint import check_pending
 from models import Autoencoder, Critic, Predictor
 from train.config import FitConfig, InferenceConfig, Recipe, StageConfig
 from train.data.batches import Targets
+from train.device import CPU
 from train.distributed import SINGLE, World
 from train.errors import UserError
 from train.timer import Timer
@@ -49,6 +51,38 @@ class TrainState:
     critic_optimiser: torch.optim.Optimizer | None = None
 
 
+_MOST_OPEN_CHECKS = 100
+
+
+class Checks:
+    """Conditions of a training, each a tensor. On a CPU they are checked at once; on a GPU, where a program would wait
+    for its whole queue, some steps later: by `settle`, which must be called before anything is kept."""
+
+    def __init__(self) -> None:
+        self._open: list[tuple[Tensor, str]] = []
+
+    def add(self, holds: Tensor, complaint: str) -> None:
+        """A condition (a scalar, bool), and what is said if it does not hold."""
+        self._open.append((holds, complaint))
+        if holds.is_cpu or len(self._open) >= _MOST_OPEN_CHECKS:
+            self.settle()
+
+    def settle(self) -> None:
+        """Waits until all conditions are known, and the layer's of the values that it was given.
+
+        Raises:
+            UserError: one does not hold; the first.
+            ValueError: one of the layer's.
+        """
+        waiting, self._open = self._open, []
+        if waiting:
+            held = torch.stack([holds for holds, _ in waiting]).tolist()  # one copy from the GPU
+            for (_, complaint), it_held in zip(waiting, held, strict=True):
+                if not it_held:
+                    raise UserError(complaint)
+        check_pending()
+
+
 @dataclasses.dataclass(frozen=True)
 class Step:
     """Which step is taken, and the tools of the trainer that a loss may need."""
@@ -59,6 +93,7 @@ class Step:
     """Number of this step within the phase, for schedules."""
     timer: Timer = dataclasses.field(default_factory=Timer)
     world: World = SINGLE
+    checks: Checks = dataclasses.field(default_factory=Checks)
 
 
 Loss = Callable[[TrainState, Any, Noise, Step], dict[str, Tensor]]
@@ -166,9 +201,9 @@ class Method(ABC):
         if missing := set(config.phases) - set(self.losses):
             raise UserError(f"{name} has no {', '.join(sorted(missing))}; leave its steps at 0")
 
-    def new_state(self, config: FitConfig) -> TrainState:
-        """Networks with freshly drawn weights, and their optimisers."""
-        network = self.build(config)
+    def new_state(self, config: FitConfig, device: torch.device = CPU) -> TrainState:
+        """Networks with freshly drawn weights, the same on every device, and their optimisers."""
+        network = self.build(config).to(device)
         return TrainState(network, adam(network))
 
     def begin_phase(self, state: TrainState, phase: str) -> None:
@@ -193,15 +228,15 @@ def set_learning_rate(optimiser: torch.optim.Optimizer, learning_rate: float) ->
 
 
 def check_finite(values: Tensor, what: str, step: Step) -> None:
-    """Ends a training whose numbers are no longer finite.
+    """Ends a training whose numbers are no longer finite; see `Checks` for when.
 
     Raises:
         UserError: some value is NaN or infinite.
     """
-    if not values.detach().isfinite().all():
-        raise UserError(
-            f"stopped at step {step.number} of the stage: {what} no longer finite; lower the learning rate"
-        )
+    step.checks.add(
+        values.detach().isfinite().all(),
+        f"stopped at step {step.number} of the stage: {what} no longer finite; lower the learning rate",
+    )
 
 
 # What the recipes of all methods share. By the paper's 30 inference steps of 0.5 the views of a network as small as cpu

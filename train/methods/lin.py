@@ -42,12 +42,12 @@ def fixed_views_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) 
     structure = network.structure(batch.images.flatten(0, 1))
     target = for_each_image(fixed_depth(targets_of(batch).points, network.config.map_size), batch)
     filled = target.isfinite()
-    place = (structure.pixels - pixel_centres(network.config.map_size)).abs().sum()
+    place = (structure.pixels - pixel_centres(network.config.map_size).to(structure.pixels)).abs().sum()
     depth = (structure.depth - target.where(filled, structure.depth.detach())).abs().sum()
     mask = F.binary_cross_entropy_with_logits(structure.logits, filled.float(), reduction="sum")
     terms = {"place": place, "depth": depth, "mask": mask}
     terms = {name: value / len(target) for name, value in terms.items()}
-    return {"loss": sum(terms.values(), torch.zeros(())), **terms}
+    return {"loss": sum(terms.values(), depth.new_zeros(())), **terms}
 
 
 def fused_projection_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) -> dict[str, Tensor]:
@@ -107,7 +107,7 @@ class Lin(Method):
         assert isinstance(network, StructureGenerator)
         size = network.config.map_size
         depth = fixed_depth(targets.points, size)
-        pixels = pixel_centres(size).expand(*depth.shape[:2], -1, -1, -1)
+        pixels = pixel_centres(size).to(depth).expand(*depth.shape[:2], -1, -1, -1)
         return network.cloud_of(Structure(pixels, depth, logits=depth.isfinite().to(depth) - 0.5))
 
 

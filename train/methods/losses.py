@@ -21,6 +21,7 @@ from diffpoint import (
 from models import Predictor
 from train.config import StageConfig, Visibility
 from train.data.batches import Batch, Targets
+from train.device import moved
 from train.methods.base import Noise
 
 # The stage-1 distance is a sum over the matched points, whose number grows with the map's area; the paper's
@@ -242,7 +243,7 @@ def nearest_prediction_loss(
     """
     count = min(_TRANSPORT_POINTS, clouds.shape[2], targets.shape[1])
     random = torch.Generator().manual_seed(step)
-    some = torch.randperm(clouds.shape[2], generator=random)[:count].to(clouds.device)
+    some = moved(torch.randperm(clouds.shape[2], generator=random)[:count], clouds.device)
     start = int(torch.randint(targets.shape[1], (), generator=random))
     evenly = farthest_point_sample(targets, count, start=start)  # its first points are spread evenly, too
     spread = torch.take_along_dim(targets, evenly[..., None], 1)
@@ -287,7 +288,7 @@ def best_of_n(
     with torch.no_grad():
         all_distances = distances(network(images, noise.codes), _SELECTION_TOLERANCE)
     best = all_distances.argmin(0)
-    codes = noise.codes[best, torch.arange(len(best))][None]
+    codes = noise.codes[best, torch.arange(len(best), device=best.device)][None]
     loss = distances(network(images, codes), TRANSPORT_TOLERANCE).mean()
     return {"loss": loss, "mean_of_all": all_distances.mean()}
 

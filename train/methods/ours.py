@@ -28,6 +28,7 @@ from models import (
 )
 from train.config import EXACT_MEAN_EMD_FROM_PAPER, FitConfig, InferenceConfig, PretrainConfig, StageConfig
 from train.data.batches import Batch
+from train.device import CPU
 from train.errors import UserError
 from train.methods.base import (
     RUN_SETTINGS,
@@ -71,20 +72,20 @@ def generator_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) ->
     front = view_loss(clouds, batch, stage, step=step.number, logits=predicted.logits)
 
     # Clouds of one image must differ as much as their codes do.
-    beta, diversity = stage.diversity_weight(step.number), torch.zeros(())
+    beta, diversity = stage.diversity_weight(step.number), clouds.new_zeros(())
     if beta > 0:
         views = batch.depth.shape[1]
         diversity = diversity_term(noise.codes, clouds, stage, views=views, step=step.number)
 
     # Of the predictions of an image, the nearest to the whole shape: each code may choose another shape.
-    shape, shape_statistics = torch.zeros(()), {}
+    shape, shape_statistics = clouds.new_zeros(()), {}
     if stage.shape_weight > 0:
         targets = for_each_image(targets_of(batch).points, batch)
         shape, shape_statistics = nearest_prediction_loss(clouds, targets, stage, step=step.number)
     timer.mark("distances")
 
     # The critic learns to tell the latents of predictions from those of real shapes; then it judges the predictions.
-    critic, critic_statistics = torch.zeros(()), {}
+    critic, critic_statistics = clouds.new_zeros(()), {}
     if stage.gamma > 0:
         assert state.critic is not None
         judged = timer.mark_in_backward(clouds, "critic")
@@ -118,7 +119,7 @@ def critic_steps(state: TrainState, fake: Tensor, batch: Batch, mix: Tensor, ste
     assert batch.real is not None and critic is not None and optimiser is not None
     real = _latents(state, batch.real)
     # The penalty is measured between a prediction and its own shape; with a pool, other code slots meet other shapes.
-    slots = torch.arange(len(fake)) % len(real)
+    slots = torch.arange(len(fake), device=fake.device) % len(real)
     partners = real[slots].repeat_interleave(batch.depth.shape[1], dim=1)
     set_learning_rate(optimiser, stage.critic_learning_rate)
     statistics: dict[str, Tensor] = {}
@@ -191,7 +192,8 @@ class Ours(Method):
 
     def build(self, config: FitConfig) -> Generator:
         generator = build_generator(config=self.network_config(config))
-        generator.computes_in = getattr(torch, config.precision)
+        generator.computes_in = torch.bfloat16 if config.precision == "bfloat16" else torch.float32
+        generator.tf32 = config.precision == "tf32"
         return generator
 
     def check(self, config: FitConfig) -> None:
@@ -207,9 +209,9 @@ class Ours(Method):
                     f"raise it, or set --{name}.beta 0 or --deterministic"
                 )
 
-    def new_state(self, config: FitConfig) -> TrainState:
-        generator = self.build(config)
-        autoencoder, critic = build_autoencoder(config.profile), Critic()
+    def new_state(self, config: FitConfig, device: torch.device = CPU) -> TrainState:
+        generator = self.build(config).to(device)
+        autoencoder, critic = build_autoencoder(config.profile).to(device), Critic().to(device)
         return TrainState(generator, adam(generator), autoencoder, critic, adam(critic))
 
     def begin_phase(self, state: TrainState, phase: str) -> None:

@@ -38,7 +38,9 @@ def solid_cells(targets: Targets, size: int) -> Tensor:
     held = ((cell >= 0) & (cell < size)).all(-1)
     x, y, z = cell.unbind(-1)
     number = torch.where(held, (x * size + y) * size + z, size**3)  # beyond the grid: a cell that is cut off
-    holds_point = torch.zeros(len(number), size**3 + 1, dtype=torch.bool).scatter_(1, number, True)[:, :-1]
+    holds_point = number.new_zeros(len(number), size**3 + 1, dtype=torch.bool).scatter_(1, number, True)[
+        :, :-1
+    ]
     return (filled | holds_point).unflatten(1, (size, size, size))
 
 

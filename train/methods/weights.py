@@ -64,7 +64,7 @@ def method_of(network: Predictor) -> Method:
 def save_weights(model: nn.Module, path: Path, *, half: bool = False) -> None:
     """Writes a network's weights and configuration, atomically; with `half` in float16, read back as float32."""
     name = _kinds()[type(model)].header
-    tensors = {name: value.detach().contiguous() for name, value in model.state_dict().items()}
+    tensors = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
     if half:
         tensors = {name: v.half() if v.is_floating_point() else v for name, v in tensors.items()}
     config = getattr(model, "config", None)
@@ -128,5 +128,5 @@ def weights_digest(network: nn.Module) -> str:
     """Changes when the weights of a network change; the name of a run is the same when it trains on."""
     digest = hashlib.sha256()
     for name, values in network.state_dict().items():
-        digest.update(name.encode() + values.numpy().tobytes())
+        digest.update(name.encode() + values.cpu().numpy().tobytes())
     return digest.hexdigest()

@@ -24,7 +24,7 @@ from train.methods.weights import OtherVersionError, read_weights, save_weights,
 def save_checkpoint(
     run: Path, step: int, networks: Mapping[str, nn.Module], state: dict[str, Any], *, keep: int = 2
 ) -> None:
-    """Writes one resumable checkpoint, atomically, then drops all but the newest.
+    """Writes one resumable checkpoint, atomically, then drops all but the newest. It can be read on any device.
 
     Args:
         run: the run's directory.
@@ -43,7 +43,7 @@ def save_checkpoint(
         for name, network in networks.items():
             save_weights(network, directory / f"{name}.safetensors")
         buffer = io.BytesIO()  # torch's own writer hides the reason when a disk is full
-        torch.save(state, buffer)
+        torch.save(_on_cpu(state), buffer)
         (directory / "state.pt").write_bytes(buffer.getbuffer())
     for old in checkpoints(run)[:-keep]:
         remove(old)
@@ -69,7 +69,18 @@ def load_state(directory: Path) -> dict[str, Any]:
         UserError: it is missing or cannot be read.
     """
     with _unreadable(directory, "state.pt"):
-        return torch.load(directory / "state.pt", weights_only=True)
+        return torch.load(directory / "state.pt", map_location="cpu", weights_only=True)
+
+
+def _on_cpu(value: Any) -> Any:
+    """The same tensors, numbers, strings, lists and dicts, tensors on the CPU."""
+    if isinstance(value, torch.Tensor):
+        return value.cpu()
+    if isinstance(value, dict):
+        return {key: _on_cpu(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(_on_cpu, value))
+    return value
 
 
 @contextmanager

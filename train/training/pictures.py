@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from models import Predictor
 from train.data.batches import LoadedSplit
+from train.evaluation.inference import predict_images
 
 _SHAPES = 3
 _CODES = 3
@@ -30,11 +31,9 @@ def draw_predictions(model: Predictor, val: LoadedSplit, path: str | Path, *, se
         views = torch.arange(val.views)
         batch = val.batch(shape[None], views[None])
         codes = torch.randn(_CODES, val.views, model.code_dim, generator=generator)
-        clouds = model(batch.images[0], codes)
-        target = val.points[shape]
-        images, camera = figures.close_up(
-            _square(batch.images[0]), batch.camera[0].resize(_PIXELS, _PIXELS), target
-        )
+        clouds = predict_images(model, batch.images[0], codes).cpu()
+        pictures, cameras, target = batch.images[0].cpu(), batch.camera[0].to("cpu"), val.points[shape].cpu()
+        images, camera = figures.close_up(_square(pictures), cameras.resize(_PIXELS, _PIXELS), target)
         joined = clouds[0].flatten(0, 1)
         examples.append(figures.Example(images, camera, 0, clouds[:, 0], joined, target))
     figures.save(figures.overview_figure(examples), path)

@@ -16,11 +16,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from models import widen
+from models import allow_tf32, widen
 from train.config import FitConfig, PretrainConfig, StageConfig, fit_config_from_json, to_json
 from train.data.augment import augment
 from train.data.batches import Batch, LoadedSplit, Sampler
 from train.data.layouts import require_depth
+from train.device import CPU, describe, moved
 from train.distributed import SINGLE, World, connect
 from train.errors import UserError
 from train.evaluation.runs import (
@@ -32,7 +33,7 @@ from train.evaluation.runs import (
 )
 from train.files import as_paths, write_text
 from train.methods import get_method
-from train.methods.base import Noise, Step, adam, check_finite, set_learning_rate
+from train.methods.base import Checks, Noise, Step, adam, check_finite, set_learning_rate
 from train.methods.weights import save_weights
 from train.processes import StopRequest, progress_bar
 from train.timer import Timer
@@ -54,6 +55,7 @@ def fit(
     *,
     resume: bool = False,
     progress: bool = True,
+    device: torch.device = CPU,
 ) -> bool:
     """Trains a network and keeps everything about it in the run directory `out`.
 
@@ -63,6 +65,8 @@ def fit(
         config: the recipe.
         resume: continue the run in `out` from its newest checkpoint, to the same bits.
         progress: show bars, and say where the time went.
+        device: on which the networks are trained; in a group of processes, each has its own. A checkpoint can be
+            continued on another one, though not to the same bits.
 
     Returns:
         True when training is complete, False when a signal (Ctrl-C, SIGTERM) ended it early, after saving.
@@ -71,11 +75,12 @@ def fit(
         UserError: unusable data or run, a configuration that does not fit them, or a training that has failed.
     """
     roots, out = as_paths(data), Path(out)
-    world = connect()
+    world = connect(device)
     progress = progress and world.is_main
     _check_run_directory(out, config, resume=resume)
     method = get_method(config.system)
     method.check(config)
+    _check_precision(config, world.device)
     require_depth(roots)
     image_size = method.image_size(config)
     train = read_split(config, roots, "train", image_size=image_size, progress=progress)
@@ -83,6 +88,15 @@ def fit(
         config, roots, "val", image_size=image_size, limit=config.validation_shapes, progress=progress
     )
     _check_fits(config, train, world)
+    if world.device != CPU:
+        train, val = train.to(world.device), val.to(world.device)
+        if progress:
+            where = (
+                "on the GPU"
+                if isinstance(train.images, Tensor)
+                else "on the CPU, for lack of memory on the GPU"
+            )
+            print(f"training on {describe(world.device)}; the training images are {where}", file=sys.stderr)
     world.barrier()  # all have looked at the directory before one writes into it
     newest = latest_checkpoint(out)
     # A checkpoint has weights of its own; those that the run started from may be gone.
@@ -126,6 +140,10 @@ def _run_phase(trainer: Trainer, run: _Run) -> bool:
     config, timer, world = trainer.config, trainer.timer, trainer.world
     shown: dict[str, str] = {}
 
+    drawn = config.picture_every > 0 and not trainer.pretraining
+    periods = [config.collapse_check_every, config.validate_every, config.log_every, config.checkpoint_every]
+    periods += [config.picture_every] if drawn else []
+
     def due(every: int) -> bool:
         return trainer.done or trainer.step % every == 0
 
@@ -141,6 +159,8 @@ def _run_phase(trainer: Trainer, run: _Run) -> bool:
             report = trainer.train_step()
             bar.update()
             stop = world.any(run.stop.requested)
+            if stop or any(map(due, periods)):
+                trainer.checks.settle()  # before anything is written
 
             record: dict[str, Any] = {}
             if due(config.collapse_check_every):
@@ -153,7 +173,6 @@ def _run_phase(trainer: Trainer, run: _Run) -> bool:
                 run.log.write(trainer.total_steps, record)
                 shown |= _bar_values(record)
                 bar.set_postfix(shown, refresh=False)
-            drawn = config.picture_every > 0 and not trainer.pretraining
             if world.is_main and drawn and due(config.picture_every):
                 picture = run.out / "figures" / f"predictions-{trainer.total_steps:08d}.png"
                 draw_predictions(trainer.state.network, run.val, picture, seed=config.seed)
@@ -185,16 +204,21 @@ class Trainer:
     def __init__(self, config: FitConfig, train: LoadedSplit, world: World = SINGLE) -> None:
         torch.manual_seed(config.seed)
         self.config, self.method = config, get_method(config.system)
-        self.world, self.timer = world, Timer()
+        self.world, self.timer, self.checks = world, Timer(world.device), Checks()
         self.total_steps = 0
         self._train = train
         self._sampler = Sampler(len(train), train.views, seed=config.seed)
         self._random = torch.Generator().manual_seed(config.seed)
         self.method.check(config)
-        self.state = self.method.new_state(config)
+        self.state = self.method.new_state(config, self.device)
         if config.start:
             self._load_weights(Path(config.start))
         self.enter_phase(next(iter(config.phases)))
+
+    @property
+    def device(self) -> torch.device:
+        """Of networks and batches. Random numbers are drawn on the CPU, so that they are the same on every device."""
+        return self.world.device
 
     @property
     def phase(self) -> PretrainConfig | StageConfig:
@@ -229,13 +253,20 @@ class Trainer:
         timer.mark("data")
 
         set_learning_rate(state.optimiser, phase.learning_rate_at(self.step))
-        step = Step(phase, self.step, timer, self.world)
-        terms = self.method.losses[self.phase_name](state, batch, noise, step)
+        step = Step(phase, self.step, timer, self.world, self.checks)
+        try:
+            terms = self.method.losses[self.phase_name](state, batch, noise, step)
+        except (
+            ValueError
+        ):  # the layer refuses numbers that are not finite, perhaps before an open check said so
+            self.checks.settle()
+            raise
         check_finite(terms["loss"], "the loss is", step)
         timer.mark("loss")
 
         state.optimiser.zero_grad(set_to_none=True)
-        terms["loss"].backward()
+        with allow_tf32(self.config.precision == "tf32" and not self.pretraining):
+            terms["loss"].backward()
         self.world.average_gradients(self.trained_network)
         state.optimiser.step()
         timer.mark("network")
@@ -265,7 +296,7 @@ class Trainer:
             batch = batch._replace(images=changed.view(batch.images.shape))
         if self.method.needs_targets(phase):
             batch = batch._replace(targets=self._train.targets(shard(shapes)))
-        return batch, Noise(shard(codes, 1), shard(mix, -1))
+        return batch, Noise(moved(shard(codes, 1), self.device), moved(shard(mix, -1), self.device))
 
     def _draw_clouds(self, shapes: int) -> Tensor:
         return self._clouds(self._sampler.draw(shapes, 1)[0])
@@ -327,7 +358,7 @@ class Trainer:
                 f"the auto-encoder makes {found.config.points} points, the generator with output head 'latent' "
                 f"{wanted}; train one of this profile, or leave --autoencoder out"
             )
-        self.state.autoencoder = found
+        self.state.autoencoder = found.to(self.device)
 
     # --- what is measured on the way
 
@@ -410,7 +441,7 @@ class Trainer:
 
 def _means(report: Mapping[str, Tensor], world: World) -> dict[str, float]:
     """A step's scalars, averaged over the processes."""
-    return dict(zip(report, world.mean(torch.stack(list(report.values()))).tolist(), strict=True))
+    return dict(zip(report, world.mean(torch.stack(list(report.values()))).cpu().tolist(), strict=True))
 
 
 def _bar_values(record: Mapping[str, Any]) -> dict[str, str]:
@@ -429,6 +460,15 @@ def _collapse_check_images(val: LoadedSplit) -> Tensor:
     shapes = numbers % len(val)
     views = (numbers // len(val) + shapes) % val.views
     return val.float_images(shapes, views[:, None])[:, 0]
+
+
+def _check_precision(config: FitConfig, device: torch.device) -> None:
+    if config.precision == "tf32" and device.type == "cpu":
+        raise UserError("--precision tf32 is a format of NVIDIA GPUs; a CPU computes in float32 or bfloat16")
+    if config.precision == "bfloat16" and device.type == "cuda" and not torch.cuda.is_bf16_supported(False):
+        raise UserError(
+            f"{describe(device)} does not compute in bfloat16 (GPUs since Ampere do); leave --precision at float32"
+        )
 
 
 def _check_fits(config: FitConfig, train: LoadedSplit, world: World) -> None:

@@ -25,8 +25,9 @@ def validate(model: Predictor, split: LoadedSplit, *, seed: int, world: World = 
     Each process of a group measures its part of the shapes.
     """
     generator = torch.Generator().manual_seed(seed)
-    codes = torch.randn(len(split), split.views, model.code_dim, generator=generator)
-    sums = torch.zeros(len(METRICS))
+    codes = torch.randn(len(split), split.views, model.code_dim, generator=generator).to(model.device)
+    split = split.to(model.device)
+    sums = torch.zeros(len(METRICS), device=model.device)
     for shapes in torch.arange(world.rank, len(split), world.size).split(_SHAPES_AT_ONCE):
         views = torch.arange(split.views).expand(len(shapes), -1)
         images = split.float_images(shapes, views)
@@ -48,7 +49,7 @@ def validate(model: Predictor, split: LoadedSplit, *, seed: int, world: World = 
                 in_silhouette(first[:, 0], seen.camera, seen.depth).float().mean(-1).sum(),
             ]
         )
-    means = (world.sum(sums) / len(split)).tolist()
+    means = (world.sum(sums) / len(split)).cpu().tolist()
     return dict(zip(METRICS, means, strict=True))
 
 
@@ -61,10 +62,9 @@ def validate_autoencoder(model: Autoencoder, split: LoadedSplit, *, seed: int) -
     """
     generator = torch.Generator().manual_seed(seed)
     some = torch.randperm(split.points.shape[1], generator=generator)[: model.config.points]
+    clouds = split.points.to(next(model.parameters()).device)
     training = model.training
     model.eval()
-    errors = [
-        cloud_errors(model(target[:, some]), target).cd for target in split.points.split(_SHAPES_AT_ONCE)
-    ]
+    errors = [cloud_errors(model(target[:, some]), target).cd for target in clouds.split(_SHAPES_AT_ONCE)]
     model.train(training)
     return {"val_autoencoder_cd": torch.cat(errors).mean().item()}

@@ -16,6 +16,7 @@ from diffpoint import farthest_point_sample, nearest, visible_points
 from models import Predictor
 from train.config import FitConfig, InferenceConfig, StageConfig, Supervision, fit_config_from_json
 from train.data.batches import Batch, LoadedSplit
+from train.evaluation.inference import predict_images
 from train.evaluation.metrics import cloud_errors, in_silhouette, visible_error
 from train.evaluation.per_shape import concatenate, one_view_each, sample_predictions
 from train.evaluation.runs import read_metrics
@@ -360,7 +361,7 @@ def predictions(study: Study) -> Figure:
     for name, config in losses.items():
         model = study.network(config, stage=1)
         codes = torch.randn(1, len(shapes), model.code_dim, generator=torch.Generator().manual_seed(0))
-        columns[name] = model(seen.images[:, 0], codes)[0]
+        columns[name] = predict_images(model, seen.images[:, 0], codes)[0]
     turn = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])  # about the vertical
     figure, panels = figures.grid(rows=2 * len(shapes), columns=len(columns) + 1)
     for shape, (upper, lower) in enumerate(panels.reshape(len(shapes), 2, -1)):
