@@ -20,14 +20,14 @@ ARCHITECTURES = (80, 90)  # A100, H100
 def main() -> None:
     for launch in json.loads(Path(sys.argv[1]).read_text()):
         kernel = getattr(importlib.import_module(launch["module"]), launch["kernel"])
-        names = [p.name for p in kernel.params]
-        constants = {
-            p.name: value
+        given = {
+            p.name: "i32" if value == 1 and p.do_not_specialize else value
             for p, value in zip(kernel.params, launch["arguments"], strict=True)
-            if p.is_constexpr
         }
-        given = dict(zip(names, launch["arguments"], strict=True))
-        signature = {name: "constexpr" if name in constants else given[name] for name in names}
+        constants = {
+            p.name: given[p.name] for p in kernel.params if p.is_constexpr or not isinstance(given[p.name], str)
+        }
+        signature = {name: "constexpr" if name in constants else value for name, value in given.items()}
         for architecture in ARCHITECTURES:
             compiled = compile_kernel(
                 ASTSource(kernel, signature=signature, constexprs=constants),

@@ -36,13 +36,18 @@ def recorded_launches(launches: dict[str, dict]) -> Iterator[None]:
             "module": kernel.fn.__module__,
             "kernel": kernel.fn.__name__,
             "arguments": [
-                value if constant else launch.type_name(value)
+                value if constant or _is_one(value) else launch.type_name(value)
                 for value, constant in zip(arguments, constants, strict=True)
             ],
             "options": options,
         }
         launches[json.dumps(described)] = described
     launch.recorded = None
+
+
+def _is_one(value: Any) -> bool:
+    """Triton compiles a kernel anew for an integer that is 1, which becomes a constant."""
+    return not isinstance(value, torch.Tensor) and value == 1
 
 
 def _constants(kernel: Any) -> list[bool]:

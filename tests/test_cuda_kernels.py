@@ -23,8 +23,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 DTYPES = (torch.float32, torch.float64)
 LAUNCHES: dict[str, dict] = {}
 OPERATORS = operator_arguments()
-WITHOUT_KERNEL = {"approxmatch"}
-"""Copied to the CPU and back."""
+ELSEWHERE = {"earth_mover_distance"}
+"""Tested in another file."""
 
 
 @pytest.fixture(autouse=True)
@@ -43,6 +43,25 @@ def test_nearest(dtype):
         found = dp.nearest(a, b, a_lengths=lengths[0], b_lengths=lengths[1])
         finite = torch.where(torch.isfinite(found.squared_distance), found.squared_distance, 0.0)
         return [*found, *torch.autograd.grad(finite.sum(), (a, b))]
+
+    assert_same(outputs, a, b, *lengths)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_approxmatch(dtype):
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.rand(3, size, 3, dtype=dtype, generator=generator) - 0.5 for size in (70, 40))
+    lengths = torch.tensor([70, 9, 1]), torch.tensor([30, 40, 1])
+    b[0, 4] = a[0, 7]  # no direction between coinciding points
+    for cloud, counts in zip((a, b), lengths, strict=True):
+        cloud[torch.arange(cloud.shape[1]) >= counts[:, None]] = torch.nan
+
+    def outputs(a, b, *lengths):
+        a, b = a.clone().requires_grad_(), b.clone().requires_grad_()
+        cost = dp.approxmatch(a, b, a_lengths=lengths[0], b_lengths=lengths[1])
+        with torch.no_grad():
+            alone = dp.approxmatch(a, b, a_lengths=lengths[0], b_lengths=lengths[1])
+        return [cost, alone, *torch.autograd.grad(cost @ torch.tensor([1.0, 2, 3], dtype=dtype), (a, b))]
 
     assert_same(outputs, a, b, *lengths)
 
@@ -161,7 +180,7 @@ def test_horizon(dtype):
     assert (here != there).double().mean() < 0.002  # logarithms are rounded differently
 
 
-@pytest.mark.parametrize("name", sorted(set(OPERATORS) - WITHOUT_KERNEL))
+@pytest.mark.parametrize("name", sorted(set(OPERATORS) - ELSEWHERE))
 def test_operators_pass_opcheck(name):
     assert name in kernels_of_operators
     arguments = on_cpu(operator_arguments)[name]
@@ -184,6 +203,8 @@ SHORT = torch.tensor([40, 41])
         (lambda: dp.chamfer_distance(POINTS, BAD, squared=True), "chamfer_distance: 'b' must be finite"),
         (lambda: dp.chamfer_distance(POINTS, POINTS[:, :0], squared=True), "'b' must hold at least one point"),
         (lambda: dp.chamfer_distance(POINTS, POINTS, squared=True, a_lengths=SHORT * 0), "empty set has no"),
+        (lambda: dp.approxmatch(POINTS, BAD), "approxmatch: 'b' must be finite"),
+        (lambda: dp.approxmatch(POINTS, POINTS, a_lengths=SHORT * 0), "approxmatch: 'a_lengths' must lie in"),
         (lambda: dp.splat_depth(BAD, CAMERA), "splat_depth: 'points' must be finite"),
         (lambda: dp.splat_depth(POINTS, CAMERA, lengths=SHORT), "splat_depth: 'lengths' must lie in"),
         (lambda: dp.sample_view(BAD, torch.ones(2, 1, 40) > 0), "sample_view: 'points' must be finite"),

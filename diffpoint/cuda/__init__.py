@@ -14,6 +14,7 @@ _MODULES = {
     "nearest": ("nearest", "nearest_backward", "nearest_both", "nearest_both_backward"),
     "splat": ("splat", "splat_backward"),
     "sampling": ("farthest_point_sample",),
+    "softmatch": ("approxmatch",),
     "transport": ("earth_mover_distance", "earth_mover_distance_backward"),
     "soft_splat": ("soft_splat", "soft_splat_backward"),
     "visibility": ("visible",),
