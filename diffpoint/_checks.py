@@ -145,7 +145,7 @@ def check_lengths_range(function: str, name: str, lengths: Tensor, largest: int,
 
 
 def deferred(bad: Tensor, function: str, argument: str, kind: str) -> bool:
-    """Whether an error is raised later if one of these flags is set: on a CUDA device, where reading them would wait."""
+    """Whether an error is raised later if one of these flags is set: on a CUDA device, where a look would wait."""
     return bad.is_cuda and defer is not None and defer(bad, function, argument, kind)
 
 
