@@ -12,6 +12,7 @@ from diffpoint.losses import (
     front_sets,
     front_terms,
 )
+from diffpoint.neighbours import Neighbours, knn
 from diffpoint.projection import projection_loss, soft_projection_loss
 from diffpoint.reproject import Reprojection, project, reproject, unproject
 from diffpoint.sampling import farthest_point_sample
@@ -29,6 +30,7 @@ __all__ = [
     "FrontSets",
     "FrontTerms",
     "Nearest",
+    "Neighbours",
     "PinholeCamera",
     "PointSets",
     "Projection",
@@ -48,6 +50,7 @@ __all__ = [
     "front_constraint",
     "front_sets",
     "front_terms",
+    "knn",
     "nearest",
     "project",
     "projection_loss",

@@ -165,6 +165,16 @@ def check_clouds(function: str, name: str, value: Any) -> Tensor:
     return check_tensor(function, name, value, ("B", "N", 3))
 
 
+def check_points(function: str, name: str, value: Any, size: str) -> Tensor:
+    """Points (*, size, 3), or (*, size, 2) in a plane; these are returned with a third coordinate of 0."""
+    check_tensor(function, name, value, ("*", size, "3 or 2"))
+    if value.shape[-1] == 2:
+        return torch.nn.functional.pad(value, (0, 1))
+    hint = f"The last size must be 3, or 2 for points in a plane, not {value.shape[-1]}."
+    check_shape(function, name, value, ("*", size, 3), hint)
+    return value
+
+
 def check_number(
     function: str, name: str, value: Any, expected: str, fits: Callable[[float], bool], hint: str = ""
 ) -> float:

@@ -39,8 +39,8 @@ def nearest(
     """d2_i = min_j |a_i - b_j|^2 and the j of the minimum (the lowest in a tie).
 
     Args:
-        a: (*B, N, 3) points, any unit.
-        b: (*B, M, 3) points, same unit, dtype and leading dimensions.
+        a: (*B, N, 3) or (*B, N, 2) points, any unit.
+        b: (*B, M, 3) or (*B, M, 2) points, same unit, dtype and leading dimensions.
         a_lengths: (*B) int64, how many of the N points count; default all.
         b_lengths: (*B) int64, how many of the M points count; default all.
 
@@ -67,8 +67,8 @@ def chamfer_distance(
     Papers differ in squares, sums and factors, so `squared` has no default and the directions are not added up.
 
     Args:
-        a: (*B, N, 3) points, any unit.
-        b: (*B, M, 3) points, same unit, dtype and leading dimensions.
+        a: (*B, N, 3) or (*B, N, 2) points, any unit.
+        b: (*B, M, 3) or (*B, M, 2) points, same unit, dtype and leading dimensions.
         squared: True for squared distances (unit^2), False for distances (unit).
         a_lengths: (*B) int64, how many of the N points count; default all.
         b_lengths: (*B) int64, how many of the M points count; default all.
@@ -105,19 +105,22 @@ def paired_sets(
     function: str, a: Tensor, b: Tensor, a_lengths: Tensor | None, b_lengths: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, tuple[int, ...]]:
     """Checked sets with one leading dimension, lengths of all sets, and the leading dimensions for the results."""
-    _checks.check_tensor(function, "a", a, ("*", "N", 3))
+    in_space = _checks.check_points(function, "a", a, "N"), _checks.check_points(function, "b", b, "M")
     batch = tuple(a.shape[:-2])
-    _checks.check_tensor(function, "b", b, ("*", "M", 3))
-    if b.shape[:-2] != a.shape[:-2]:
-        wanted = "(" + "".join(f"{s}, " for s in batch) + "M, 3) to match 'a'"
-        raise _checks.fail(
-            function, "b", f"have shape {wanted}", str(tuple(b.shape)), "Did you forget to batch?"
+    if b.shape[:-2] != a.shape[:-2] or b.shape[-1] != a.shape[-1]:
+        wanted = "(" + "".join(f"{s}, " for s in batch) + f"M, {a.shape[-1]}) to match 'a'"
+        same_space = b.shape[-1] == a.shape[-1]
+        hint = (
+            "Did you forget to batch?"
+            if same_space
+            else "A distance is in space or in the plane, not between."
         )
+        raise _checks.fail(function, "b", f"have shape {wanted}", str(tuple(b.shape)), hint)
     _checks.check_same_dtype(function, a=a, b=b)
     la = _checks.check_lengths(function, "a_lengths", a_lengths, batch, a.shape[-2], a)
     lb = _checks.check_lengths(function, "b_lengths", b_lengths, batch, b.shape[-2], b)
     count = torch.Size(batch).numel()
-    a3, b3 = a.reshape(count, *a.shape[-2:]), b.reshape(count, *b.shape[-2:])
+    a3, b3 = (x.reshape(count, *x.shape[-2:]) for x in in_space)
     la = _bridge.full_lengths(la, count, a.shape[-2], a)
     lb = _bridge.full_lengths(lb, count, b.shape[-2], b)
     return a3, b3, la, lb, batch
@@ -159,7 +162,7 @@ def _nearest_backward(
     a: Tensor, b: Tensor, index: Tensor, grad_squared_distance: Tensor
 ) -> tuple[Tensor, Tensor]:
     grad_a, grad_b = a.new_zeros(a.shape), b.new_zeros(b.shape)
-    _add_gradients(a, b, index, grad_squared_distance, grad_a, grad_b)
+    add_nearest_gradients(a, b, index, grad_squared_distance, grad_a, grad_b)
     return grad_a, grad_b
 
 
@@ -202,8 +205,8 @@ def _nearest_both_backward(
     a: Tensor, b: Tensor, from_a: Tensor, from_b: Tensor, grad_from_a: Tensor, grad_from_b: Tensor
 ) -> tuple[Tensor, Tensor]:
     grad_a, grad_b = a.new_zeros(a.shape), b.new_zeros(b.shape)
-    _add_gradients(a, b, from_a, grad_from_a, grad_a, grad_b)
-    _add_gradients(b, a, from_b, grad_from_b, grad_b, grad_a)
+    add_nearest_gradients(a, b, from_a, grad_from_a, grad_a, grad_b)
+    add_nearest_gradients(b, a, from_b, grad_from_b, grad_b, grad_a)
     return grad_a, grad_b
 
 
@@ -232,8 +235,9 @@ def _search_blocks(a: Blocks, b: Blocks, a_lengths: Tensor, b_lengths: Tensor) -
     return squared_distance, index
 
 
-def _add_gradients(
+def add_nearest_gradients(
     a: Tensor, b: Tensor, index: Tensor, grad_squared_distance: Tensor, grad_a: Tensor, grad_b: Tensor
 ) -> None:
+    """Adds the gradients of squared distances from each point of `a` to one or several neighbours, in order."""
     if a.numel() and b.numel():
         _bridge.launch("nearest", "backward", a.dtype, a, b, index, grad_squared_distance, grad_a, grad_b)

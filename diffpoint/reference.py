@@ -16,7 +16,7 @@ from torch import Tensor
 
 
 def pairwise_squared_distance(a: Tensor, b: Tensor) -> Tensor:
-    """(*B, N, 3), (*B, M, 3) -> (*B, N, M)."""
+    """(*B, N, D), (*B, M, D) -> (*B, N, M)."""
     return (a[..., :, None, :] - b[..., None, :, :]).square().sum(-1)
 
 
@@ -251,6 +251,35 @@ def nearest(
         index = torch.where(torch.isinf(d), -1, index)
     if a_lengths is not None:
         inside = _mask(a, a_lengths)
+        d, index = torch.where(inside, d, 0.0), torch.where(inside, index, -1)
+    return d, index
+
+
+def knn(
+    a: Tensor,
+    b: Tensor,
+    k: int,
+    *,
+    a_lengths: Tensor | None = None,
+    b_lengths: Tensor | None = None,
+    radius: float | None = None,
+    exclude_self: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Squared distance (*B, N, k) and index (*B, N, k)."""
+    matrix = pairwise_squared_distance(a, b)
+    if b_lengths is not None:
+        matrix = torch.where(_mask(b, b_lengths)[..., None, :], matrix, torch.inf)
+    if radius is not None:
+        matrix = torch.where(matrix <= a.new_tensor(radius).square(), matrix, torch.inf)
+    if exclude_self:
+        matrix = torch.where(torch.eye(a.shape[-2], dtype=torch.bool), torch.inf, matrix)
+    none = matrix.new_full((*matrix.shape[:-1], k), torch.inf)
+    matrix = torch.cat((matrix, none), -1)
+    index = matrix.detach().sort(dim=-1, stable=True).indices[..., :k]
+    d = torch.take_along_dim(matrix, index, dim=-1)
+    index = torch.where(torch.isinf(d), -1, index)
+    if a_lengths is not None:
+        inside = _mask(a, a_lengths)[..., None]
         d, index = torch.where(inside, d, 0.0), torch.where(inside, index, -1)
     return d, index
 

@@ -17,7 +17,7 @@ def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Te
     """Indices of k points; each is the farthest from those chosen before it.
 
     Args:
-        points: (*B, N, 3), any unit.
+        points: (*B, N, 3) or (*B, N, 2), any unit.
         k: how many points to choose, at most the size of the smallest cloud.
         start: index of the first chosen point.
         lengths: (*B) int64, how many of the N points count; default all.
@@ -34,7 +34,7 @@ def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Te
         >>> farthest_point_sample(torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2).tolist()
         [0, 2]
     """
-    _checks.check_tensor("farthest_point_sample", "points", points, ("*", "N", 3))
+    points = _checks.check_points("farthest_point_sample", "points", points, "N")
     batch = tuple(points.shape[:-2])
     lengths = _checks.check_lengths(
         "farthest_point_sample", "lengths", lengths, batch, points.shape[-2], points

@@ -6,7 +6,7 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 import diffpoint as dp
-from diffpoint import distances, reference, sampling
+from diffpoint import distances, neighbours, reference, sampling
 from diffpoint.testing import assert_close
 
 DTYPES = (torch.float32, torch.float64)
@@ -64,6 +64,105 @@ def test_distances_beyond_the_number_format_are_infinite(monkeypatch, large):
     assert far.a_to_b.item() == torch.inf
     gradients = torch.autograd.grad(far.a_to_b, (a, b))
     assert all(torch.isfinite(g).all() for g in gradients)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (33, 70), (500, 1300), (40, 2100)])
+@pytest.mark.parametrize("kind", ["random", "lattice", "one place", "extreme", "beyond the format"])
+@pytest.mark.parametrize("by_sorting", [False, True])
+def test_neighbours_are_those_of_the_reference_to_the_bit(monkeypatch, dtype, n, m, kind, by_sorting):
+    """Also in ties, where the lower index comes first; with fewer than k in reach; by either way of searching."""
+    if by_sorting:
+        monkeypatch.setattr(neighbours, "_LARGE_K", 0)
+        monkeypatch.setattr(neighbours, "_SORTED_AT_ONCE", 30 * m)
+    a, b = random(3, n, 3, seed=1, dtype=dtype), random(3, m, 3, seed=2, dtype=dtype)
+    if kind == "lattice":
+        a, b = (a * 4).round(), (b * 4).round()
+    elif kind == "one place":
+        a, b = torch.full_like(a, 0.3), torch.full_like(b, 0.3)
+    elif kind == "extreme":
+        a, b = a * 1e6, b * 1e-6
+    elif kind == "beyond the format":  # some of the squares are infinite
+        a, b = ((x.double() * (1e20 if dtype == torch.float32 else 1e155)).to(dtype) for x in (a, b))
+    lengths = torch.tensor([n, n // 2, n])
+    clouds = {"a_lengths": lengths, "b_lengths": torch.tensor([m, m, m // 3])}
+    itself = {"a_lengths": lengths, "b_lengths": lengths, "exclude_self": True}
+    for k in (1, 5, 20):
+        for radius in (None, 0.3, 2.0):
+            for second, options in ((b, clouds), (a, itself)):
+                ours = dp.knn(a, second, k, radius=radius, **options)
+                theirs = reference.knn(a, second, k, radius=radius, **options)
+                assert torch.equal(ours.index, theirs[1])
+                assert torch.equal(ours.squared_distance, theirs[0])
+
+
+def test_more_neighbours_than_the_kernel_keeps():
+    a, b = random(1, 40, 3, seed=1), random(1, 400, 3, seed=2)
+    for k in (neighbours._LARGE_K, neighbours._LARGE_K + 1, 500):
+        ours, theirs = dp.knn(a, b, k), reference.knn(a, b, k)
+        assert torch.equal(ours.index, theirs[1])
+        assert torch.equal(ours.squared_distance, theirs[0])
+
+
+def test_the_nearest_neighbour_is_nearest():
+    a, b = random(2, 300, 3, seed=1), random(2, 500, 3, seed=2)
+    one, nearest = dp.knn(a, b, 1), dp.nearest(a, b)
+    assert torch.equal(one.index[..., 0], nearest.index)
+    assert torch.equal(one.squared_distance[..., 0], nearest.squared_distance)
+
+
+def test_a_radius_counts_the_points_at_it():
+    line = torch.arange(5.0)[:, None] * torch.tensor([1.0, 0, 0])
+    found = dp.knn(line, line, 4, radius=1.0, exclude_self=True)
+    assert found.index.tolist() == [
+        [1, -1, -1, -1],
+        [0, 2, -1, -1],
+        [1, 3, -1, -1],
+        [2, 4, -1, -1],
+        [3, -1, -1, -1],
+    ]
+    assert found.squared_distance[0].tolist() == [1.0, torch.inf, torch.inf, torch.inf]
+    assert dp.knn(line, line, 1, radius=0.0).index[:, 0].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_only_a_cloud_itself_has_a_self_to_exclude():
+    a = random(2, 9, 3)
+    copy, padded = a.clone(), a.clone()
+    padded[1, 8] = 9.0
+    lengths = {"a_lengths": torch.tensor([9, 8]), "b_lengths": torch.tensor([9, 8])}
+    for b, options in ((copy, {}), (padded, lengths)):
+        ours, same = (dp.knn(a, x, 2, exclude_self=True, **options) for x in (b, a))
+        assert torch.equal(ours.index, same.index)
+    for b, options in ((padded, {}), (a.flip(1), {}), (a, {"a_lengths": torch.tensor([9, 8])})):
+        with pytest.raises(ValueError, match="knn: 'b' must hold the points of 'a' with exclude_self=True"):
+            dp.knn(a, b, 2, exclude_self=True, **options)
+    with pytest.raises(
+        ValueError, match=r"knn: 'b' must have shape \(2, 9, 3\).*pass the points of 'a' again"
+    ):
+        dp.knn(a, a[:, :5], 2, exclude_self=True)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_points_in_a_plane_have_the_distances_of_points_in_space(dtype):
+    a, b = leaf(2, 30, 2, seed=1, dtype=dtype), leaf(2, 40, 2, seed=2, dtype=dtype)
+    a3, b3 = (torch.nn.functional.pad(x, (0, 1)) for x in (a, b))
+    for op in (
+        dp.nearest,
+        lambda x, y: dp.knn(x, y, 3),
+        lambda x, y: dp.chamfer_distance(x, y, squared=False),
+        lambda x, y: dp.earth_mover_distance(x, y)[:2],
+        lambda x, y: (dp.approxmatch(x, y),),
+    ):
+        plane, space = op(a, b), op(a3, b3)
+        assert all(torch.equal(x, y) for x, y in zip(plane, space, strict=True))
+        gradients = [torch.autograd.grad(result[0].sum(), (a, b)) for result in (plane, space)]
+        assert gradients[0][0].shape == (2, 30, 2)
+        assert all(torch.equal(x, y) for x, y in zip(*gradients, strict=True))
+    assert torch.equal(dp.farthest_point_sample(a, 9), dp.farthest_point_sample(a3, 9))
+    with pytest.raises(ValueError, match=r"'b' must have shape \(2, M, 2\) to match 'a'; got \(2, 40, 3\)"):
+        dp.nearest(a, b3)
+    with pytest.raises(ValueError, match="The last size must be 3, or 2 for points in a plane, not 4"):
+        dp.nearest(torch.zeros(2, 5, 4), b3)
 
 
 def test_chamfer_of_large_clouds_is_that_of_small_ones(monkeypatch):

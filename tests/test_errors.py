@@ -27,6 +27,8 @@ CLOUDS: Ops = {
 SETS: Ops = {
     "nearest a": lambda x: dp.nearest(x, torch.rand(2, 5, 3)),
     "nearest b": lambda x: dp.nearest(torch.rand(2, 5, 3), x),
+    "knn a": lambda x: dp.knn(x, torch.rand(2, 5, 3), 2),
+    "knn b": lambda x: dp.knn(torch.rand(2, 5, 3), x, 2),
     "chamfer_distance a": lambda x: dp.chamfer_distance(x, torch.rand(2, 5, 3), squared=True),
     "chamfer_distance b": lambda x: dp.chamfer_distance(torch.rand(2, 5, 3), x, squared=True),
     "earth_mover_distance a": lambda x: dp.earth_mover_distance(x, torch.rand(2, 5, 3)),
@@ -163,6 +165,9 @@ def test_options_out_of_range():
     for call, message in (
         (lambda: dp.splat_depth(points, CAMERA, radius=-1.0), "'radius' must be a finite number"),
         (lambda: dp.splat_depth(points, CAMERA, radius=float("nan")), "'radius' must be a finite number"),
+        (lambda: dp.knn(points, points, 0), "'k' must be a positive integer"),
+        (lambda: dp.knn(points, points, 1, radius=-1.0), "'radius' must be a number of at least 0"),
+        (lambda: dp.knn(points, points, 1, radius=float("nan")), "'radius' must be a number of at least 0"),
         (lambda: dp.farthest_point_sample(points, 6), "'k' must be at most 5"),
         (lambda: dp.farthest_point_sample(points, -1), "'k' must be an integer of at least 0"),
         (lambda: dp.farthest_point_sample(points, 2, start=5), "'start' must be at most 4"),
@@ -182,12 +187,20 @@ def test_options_out_of_range():
             call()
 
 
-@pytest.mark.parametrize("op", CLOUDS | SETS)
+@pytest.mark.parametrize("op", CLOUDS)
 @pytest.mark.parametrize("shape", [(2, 7, 2), (7, 2), (2, 7, 4), (2,)])
 def test_a_wrong_last_size_is_named(op, shape):
     """Also where a dimension is missing, as in a cloud (7, 2) of points in the plane."""
     with pytest.raises(ValueError, match=rf"The last size must be 3, not {shape[-1]}\.$"):
-        (CLOUDS | SETS)[op](torch.rand(shape))
+        CLOUDS[op](torch.rand(shape))
+
+
+@pytest.mark.parametrize("op", SETS)
+@pytest.mark.parametrize("shape", [(2, 7, 4), (7, 1)])
+def test_sets_are_in_space_or_in_a_plane(op, shape):
+    message = rf"The last size must be 3, or 2 for points in a plane, not {shape[-1]}\.$"
+    with pytest.raises(ValueError, match=message):
+        SETS[op](torch.rand(shape))
 
 
 NUMBERS: dict[str, tuple[str, Callable]] = {
@@ -244,7 +257,9 @@ def test_numbers_are_those_of_python_and_numpy(op):
         assert all(torch.equal(x, y) for x, y in zip(leaves(call(number)), plain, strict=True))
     function = op.split()[0]
     for tensor in (torch.tensor(0.5), torch.tensor(0.5, requires_grad=True), torch.rand(5)):
-        message = rf"^{function}: '{name}' must be a Python or numpy number; got a torch\.Tensor, .* no gradient"
+        message = (
+            rf"^{function}: '{name}' must be a Python or numpy number; got a torch\.Tensor, .* no gradient"
+        )
         with pytest.raises(TypeError, match=message):
             call(tensor)
     for other in ("0.5", True, [0.5]):
@@ -274,12 +289,15 @@ def test_an_empty_batch_has_an_empty_result(count):
     depth = torch.zeros(0, 2, 8, 8)
     results = [
         *dp.nearest(points, points),
+        *dp.knn(points, points, 2, exclude_self=True),
         *dp.chamfer_distance(points, points, squared=True),
         *dp.earth_mover_distance(points, points),
         dp.approxmatch(points, points),
         dp.farthest_point_sample(points, 3),
         dp.consistency_loss(points[:, None].expand(0, 2, count, 3), reduction="none"),
-        dp.diversity_loss(torch.ones(2, 0, 4), points[None].expand(2, 0, count, 3), alpha=1.0, reduction="none"),
+        dp.diversity_loss(
+            torch.ones(2, 0, 4), points[None].expand(2, 0, count, 3), alpha=1.0, reduction="none"
+        ),
     ]
     for camera in (CAMERA, NO_CAMERA):
         splat = dp.splat_depth(points, camera)

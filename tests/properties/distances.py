@@ -48,6 +48,49 @@ def check_nearest(recipes: tuple[strategies.Recipe, strategies.Recipe]) -> str:
     return AGREED
 
 
+def check_knn(
+    recipes: tuple[strategies.Recipe, strategies.Recipe], k: int, radius: float | None, exclude_self: bool
+) -> str:
+    a, b = (r.make() for r in recipes)
+    if exclude_self:
+        b = a
+    lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
+    result = refuse_or_run(
+        lambda: dp.knn(a.points, b.points, k, radius=radius, exclude_self=exclude_self, **lengths),
+        a.poisoned or b.poisoned,
+        "knn",
+    )
+    if result is None:
+        return REFUSED
+    x, y = a.clean, b.clean
+    every, _ = reference.knn(x, y, k, exclude_self=exclude_self, **lengths)
+    inside = (torch.arange(x.shape[-2]) < a.counts[..., None])[..., None]
+    real = result.index >= 0
+    if radius is None:
+        assert_within(result.squared_distance, every, 16 * eps(x.dtype) * every)
+        available = (b.counts - int(exclude_self)).clamp(0, k)[..., None]
+        assert torch.equal(real.sum(-1), torch.where(inside[..., 0], available, 0))
+    else:
+        surely, perhaps = (every <= radius**2 * (1 + sign * 16 * eps(x.dtype)) for sign in (-1, 1))
+        assert (real >= surely & inside).all()
+        assert (real <= perhaps & inside).all()
+        assert_within(result.squared_distance[real], every[real], 16 * eps(x.dtype) * every[real])
+        assert (result.squared_distance[~real & inside.expand(real.shape)] == torch.inf).all()
+    assert (result.squared_distance.diff(dim=-1)[real[..., 1:]] >= 0).all()
+    assert (result.index < b.counts[..., None, None]).all()
+    if real.any():
+        chosen = y.unsqueeze(-3).expand(*x.shape[:-1], *y.shape[-2:])
+        chosen = torch.take_along_dim(chosen, result.index.clamp(min=0)[..., None], -2)
+        attained = (x[..., None, :] - chosen).double().square().sum(-1)
+        assert_within(attained[real], every[real].double(), 16 * eps(x.dtype) * every[real])
+        equal = (chosen[..., 1:, :] == chosen[..., :-1, :]).all(-1) & real[..., 1:]
+        assert (result.index.diff(dim=-1)[equal] > 0).all(), "the lowest of equals first"
+        if exclude_self:
+            assert (result.index != torch.arange(x.shape[-2])[:, None])[real].all()
+        assert_finite_gradients(result.squared_distance, *{a.points, b.points})
+    return AGREED
+
+
 def _empty(*clouds: strategies.Cloud) -> bool:
     """Whether one of them has a set without points. A batch of no sets has none."""
     return any(bool((c.counts == 0).any()) for c in clouds)
