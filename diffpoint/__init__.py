@@ -2,7 +2,7 @@
 
 from diffpoint._runtime import RuntimeInfo, configure, runtime_info
 from diffpoint.camera import PinholeCamera, PointSets, Projection
-from diffpoint.distances import Chamfer, Nearest, chamfer_distance, nearest
+from diffpoint.distances import Chamfer, FScore, Nearest, chamfer_distance, f_score, nearest
 from diffpoint.losses import (
     FrontSets,
     FrontTerms,
@@ -27,6 +27,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Chamfer",
+    "FScore",
     "FrontSets",
     "FrontTerms",
     "Nearest",
@@ -46,6 +47,7 @@ __all__ = [
     "consistency_loss",
     "diversity_loss",
     "earth_mover_distance",
+    "f_score",
     "farthest_point_sample",
     "front_constraint",
     "front_sets",

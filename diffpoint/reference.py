@@ -285,18 +285,48 @@ def knn(
 
 
 def chamfer_distance(
-    a: Tensor, b: Tensor, *, squared: bool, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+    a: Tensor,
+    b: Tensor,
+    *,
+    squared: bool,
+    reduction: str = "mean",
+    a_lengths: Tensor | None = None,
+    b_lengths: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """a_to_b (*B) and b_to_a (*B)."""
+    """a_to_b (*B) and b_to_a (*B); (*B, N) and (*B, M) with reduction "none"."""
     directions = []
     for first, second, first_lengths, second_lengths in (
         (a, b, a_lengths, b_lengths),
         (b, a, b_lengths, a_lengths),
     ):
         d, _ = nearest(first, second, a_lengths=first_lengths, b_lengths=second_lengths)
+        d = d if squared else _sqrt(d)
         count = first.shape[-2] if first_lengths is None else first_lengths
-        directions.append((d if squared else _sqrt(d)).sum(-1) / count)
+        if reduction == "mean":
+            d = d.sum(-1) / count
+        elif reduction != "none":
+            d = d.sum(-1) if reduction == "sum" else d.amax(-1)
+        directions.append(d)
     return directions[0], directions[1]
+
+
+def f_score(
+    a: Tensor,
+    b: Tensor,
+    threshold: float,
+    *,
+    a_lengths: Tensor | None = None,
+    b_lengths: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """F-score, precision and recall (*B)."""
+    lengths = {"a_lengths": a_lengths, "b_lengths": b_lengths}
+    distances = chamfer_distance(a, b, squared=False, reduction="none", **lengths)
+    shares = []
+    for points, d, count in zip((a, b), distances, (a_lengths, b_lengths), strict=True):
+        count = torch.full(points.shape[:-2], points.shape[-2]) if count is None else count
+        shares.append(((d <= threshold) & _mask(points, count)).sum(-1).to(a.dtype) / count)
+    precision, recall = shares
+    return (2 * precision * recall / (precision + recall)).nan_to_num(0.0), precision, recall
 
 
 def earth_mover_distance(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import directed_hausdorff
 
 import diffpoint as dp
 from diffpoint import distances, neighbours, reference, sampling
@@ -184,6 +185,44 @@ def test_chamfer_of_a_shifted_lattice_is_the_shift():
     assert_close(torch.stack(chamfer), torch.tensor([0.1, 0.1]), scale=10)
     squared = dp.chamfer_distance(lattice, lattice + shift, squared=True)
     assert_close(torch.stack(squared), torch.tensor([0.01, 0.01]), scale=10)
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_reductions_of_the_distances_of_the_points(squared):
+    a, b = random(2, 40, 3, seed=1), random(2, 30, 3, seed=2)
+    lengths = {"a_lengths": torch.tensor([40, 7]), "b_lengths": torch.tensor([30, 11])}
+    each = dp.chamfer_distance(a, b, squared=squared, reduction="none", **lengths)
+    assert each.a_to_b.shape == (2, 40)
+    assert each.b_to_a.shape == (2, 30)
+    assert (each.a_to_b[1, 7:] == 0).all()
+    for reduction in ("mean", "sum", "max"):
+        reduced = dp.chamfer_distance(a, b, squared=squared, reduction=reduction, **lengths)
+        for d, total, count in zip(each, reduced, lengths.values(), strict=True):
+            expected = {"mean": d.sum(-1) / count, "sum": d.sum(-1), "max": d.amax(-1)}
+            assert torch.equal(total, expected[reduction])
+        assert torch.equal(reduced.total, reduced.a_to_b + reduced.b_to_a)
+    default = dp.chamfer_distance(a, b, squared=squared, **lengths)
+    assert torch.equal(default.a_to_b, each.a_to_b.sum(-1) / lengths["a_lengths"])
+
+
+def test_the_largest_directed_distance_is_scipys_hausdorff_distance():
+    a, b = random(70, 3, seed=1), random(50, 3, seed=2)
+    directed = dp.chamfer_distance(a, b, squared=False, reduction="max")
+    scipys = [directed_hausdorff(x, y)[0] for x, y in ((a, b), (b, a))]
+    assert torch.stack(directed).tolist() == pytest.approx(scipys)
+
+
+def test_the_f_score_counts_points_within_the_threshold():
+    target = torch.arange(10.0)[:, None] * torch.tensor([1.0, 0, 0])
+    predicted = torch.cat((target[:4] + torch.tensor([0.0, 0.25, 0]), target[:2] + 50))
+    score = dp.f_score(predicted, target, 0.25)
+    assert score.precision.item() == pytest.approx(4 / 6)
+    assert score.recall.item() == pytest.approx(4 / 10)
+    assert score.f_score.item() == pytest.approx(2 * (4 / 6) * 0.4 / (4 / 6 + 0.4))
+    assert [s.item() for s in dp.f_score(predicted, target, 0.24)] == [0, 0, 0]
+    assert [s.item() for s in dp.f_score(target, target, 0.0)] == [1, 1, 1]
+    padded = dp.f_score(predicted, target, 0.25, a_lengths=torch.tensor(4), b_lengths=torch.tensor(8))
+    assert (padded.precision.item(), padded.recall.item()) == (1.0, 0.5)
 
 
 def test_chamfer_of_a_set_with_itself_is_zero_with_zero_gradient():

@@ -29,6 +29,8 @@ SETS: Ops = {
     "nearest b": lambda x: dp.nearest(torch.rand(2, 5, 3), x),
     "knn a": lambda x: dp.knn(x, torch.rand(2, 5, 3), 2),
     "knn b": lambda x: dp.knn(torch.rand(2, 5, 3), x, 2),
+    "f_score a": lambda x: dp.f_score(x, torch.rand(2, 5, 3), 0.1),
+    "f_score b": lambda x: dp.f_score(torch.rand(2, 5, 3), x, 0.1),
     "chamfer_distance a": lambda x: dp.chamfer_distance(x, torch.rand(2, 5, 3), squared=True),
     "chamfer_distance b": lambda x: dp.chamfer_distance(torch.rand(2, 5, 3), x, squared=True),
     "earth_mover_distance a": lambda x: dp.earth_mover_distance(x, torch.rand(2, 5, 3)),
@@ -112,6 +114,7 @@ def test_empty_sets_have_no_distance():
     full, empty = torch.rand(2, 5, 3), torch.rand(2, 0, 3)
     for function in (
         lambda a, b, **k: dp.chamfer_distance(a, b, squared=False, **k),
+        lambda a, b, **k: dp.f_score(a, b, 0.1, **k),
         dp.earth_mover_distance,
     ):
         for a, b in ((full, empty), (empty, full)):
@@ -165,6 +168,11 @@ def test_options_out_of_range():
     for call, message in (
         (lambda: dp.splat_depth(points, CAMERA, radius=-1.0), "'radius' must be a finite number"),
         (lambda: dp.splat_depth(points, CAMERA, radius=float("nan")), "'radius' must be a finite number"),
+        (lambda: dp.f_score(points, points, -0.1), "'threshold' must be a number of at least 0"),
+        (
+            lambda: dp.chamfer_distance(points, points, squared=True, reduction="max over"),
+            "'reduction' must be one of 'mean', 'sum', 'max', 'none'",
+        ),
         (lambda: dp.knn(points, points, 0), "'k' must be a positive integer"),
         (lambda: dp.knn(points, points, 1, radius=-1.0), "'radius' must be a number of at least 0"),
         (lambda: dp.knn(points, points, 1, radius=float("nan")), "'radius' must be a number of at least 0"),
@@ -290,7 +298,12 @@ def test_an_empty_batch_has_an_empty_result(count):
     results = [
         *dp.nearest(points, points),
         *dp.knn(points, points, 2, exclude_self=True),
-        *dp.chamfer_distance(points, points, squared=True),
+        *(
+            x
+            for how in ("mean", "sum", "max", "none")
+            for x in dp.chamfer_distance(points, points, squared=True, reduction=how)
+        ),
+        *dp.f_score(points, points, 0.1),
         *dp.earth_mover_distance(points, points),
         dp.approxmatch(points, points),
         dp.farthest_point_sample(points, 3),

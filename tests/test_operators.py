@@ -26,6 +26,7 @@ def operator_arguments() -> dict[str, tuple]:
         "nearest": (a, b, *lengths),
         "nearest_both": (a, b, *lengths),
         "knn": (a, b, *lengths, 3, 0.8, False),
+        "shares_within": (a.detach(), b.detach(), *lengths, 0.4),
         "splat": (a, lengths[0], projection, H, W, 0.0),
         "soft_splat": (*soft, lengths[0], H, W, 2.0, 0.05),
         "project": (a, projection),
@@ -148,6 +149,7 @@ def every_op(points: torch.Tensor, target: torch.Tensor, camera: dp.PinholeCamer
     outputs += dp.soft_splat(points, camera, lengths=torch.full((2,), 50, device=target.device))
     outputs += [*dp.nearest(points, target), *dp.chamfer_distance(points, target, squared=False)]
     outputs += dp.earth_mover_distance(points, target)
+    outputs += dp.f_score(points, target, 0.1, b_lengths=torch.full((2,), 40, device=target.device))
     outputs += dp.knn(points, target, 4, a_lengths=torch.full((2,), 50, device=target.device))
     # The lazy device lacks a view that torch takes in the backward pass of masked_scatter: no gradient of this one.
     constraint = dp.front_constraint(points, camera, splat.depth.detach() + 0.1).detach()

@@ -62,6 +62,7 @@ def arguments(name: str, largest: int, family: str) -> tuple[st.SearchStrategy, 
             st.booleans(),
         ),
         "chamfer_distance": (strategies.pairs(largest, family),),
+        "f_score": (strategies.pairs(largest, family), st.sampled_from([0.0, 1e-6, 0.1, 1e9])),
         "earth_mover_distance": (strategies.pairs(largest // 2, family),),
         "approxmatch": (strategies.pairs(largest // 2, family),),
         "farthest_point_sample": (

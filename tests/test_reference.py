@@ -188,6 +188,9 @@ CASES = {
     ),
     "chamfer_distance": two_sets("chamfer_distance", squared=False),
     "chamfer_distance, squared": two_sets("chamfer_distance", squared=True),
+    "chamfer_distance, sum": two_sets("chamfer_distance", squared=False, reduction="sum"),
+    "chamfer_distance, max": two_sets("chamfer_distance", squared=True, reduction="max"),
+    "chamfer_distance, none": two_sets("chamfer_distance", squared=False, reduction="none"),
     "earth_mover_distance": Case(
         sets,
         lambda a, b: dp.earth_mover_distance(a, b, a_lengths=LENGTHS, tolerance=1e-7)[:2],

@@ -115,6 +115,27 @@ def check_chamfer_distance(recipes: tuple[strategies.Recipe, strategies.Recipe])
     return AGREED
 
 
+def check_f_score(recipes: tuple[strategies.Recipe, strategies.Recipe], threshold: float) -> str:
+    a, b = (r.make() for r in recipes)
+    lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
+    result = refuse_or_run(
+        lambda: dp.f_score(a.points, b.points, threshold, **lengths),
+        a.poisoned or b.poisoned or _empty(a, b),
+        "f_score",
+    )
+    if result is None:
+        return REFUSED
+    # Rounding decides for distances at the threshold.
+    fewest, most = (
+        reference.f_score(a.clean, b.clean, threshold * (1 + sign * 16 * eps(a.clean.dtype)), **lengths)
+        for sign in (-1, 1)
+    )
+    for low, value, high in zip(fewest, result, most, strict=True):
+        assert (low <= value * (1 + 8 * eps(value.dtype))).all()
+        assert (value <= high * (1 + 8 * eps(value.dtype))).all()
+    return AGREED
+
+
 def check_earth_mover_distance(recipes: tuple[strategies.Recipe, strategies.Recipe]) -> str:
     a, b = (r.make() for r in recipes)
     lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
