@@ -419,19 +419,23 @@ def soft_match(squared_distance: Tensor) -> Tensor:
     return match
 
 
-def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Tensor | None = None) -> Tensor:
-    """Indices (*B, k)."""
-    distance = points.new_full(points.shape[:-1], torch.inf)
-    if lengths is not None:
-        distance = torch.where(_mask(points, lengths), distance, -1.0)
-    current = torch.full(points.shape[:-2], start)
-    chosen = []
-    for _ in range(k):
-        chosen.append(current)
+def farthest_point_sample(
+    points: Tensor, k: int | Tensor, *, start: int | Tensor = 0, lengths: Tensor | None = None
+) -> Tensor:
+    """Indices (*B, k); -1 after the k points of a cloud, or after all that it has."""
+    batch = points.shape[:-2]
+    sizes = torch.full(batch, points.shape[-2]) if lengths is None else lengths
+    counts = torch.as_tensor(k).expand(batch)
+    distance = torch.where(_mask(points, sizes), torch.inf, -1.0).to(points.dtype)
+    current = torch.as_tensor(start).expand(batch)
+    chosen = torch.full((*batch, int(torch.as_tensor(k).max())), -1)
+    for step in range(chosen.shape[-1] if points.shape[-2] else 0):
+        chosen[..., step] = torch.where(step < torch.minimum(counts, sizes), current, -1)
         here = torch.take_along_dim(points, current[..., None, None], dim=-2)
         distance = torch.minimum(distance, (points - here).square().sum(-1))
+        distance = distance.scatter(-1, current[..., None], -1.0)  # none is chosen twice
         current = (distance == distance.max(-1, keepdim=True).values).to(torch.uint8).argmax(-1)
-    return torch.stack(chosen, dim=-1) if chosen else torch.empty(*points.shape[:-2], 0, dtype=torch.long)
+    return chosen
 
 
 def front_constraint(

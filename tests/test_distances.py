@@ -317,6 +317,80 @@ def test_farthest_points_of_large_and_small_clouds_come_in_the_same_order(monkey
         assert torch.equal(every_distance, with_boxes)
 
 
+@pytest.mark.parametrize("large", [False, True])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_no_point_is_chosen_twice(monkeypatch, large, dtype):
+    """Not even where all that remain lie on chosen ones; these come in order."""
+    if large:
+        monkeypatch.setattr(sampling, "_LARGE", 0)
+    duplicates = random(2, 3, 3, dtype=dtype).repeat(1, 14, 1)
+    for points in (duplicates, torch.full((2, 40, 3), 0.3, dtype=dtype), random(2, 40, 3, dtype=dtype)):
+        size = points.shape[1]
+        chosen = dp.farthest_point_sample(points, size, start=5)
+        assert torch.equal(chosen, reference.farthest_point_sample(points, size, start=5))
+        assert torch.equal(chosen.sort(-1).values, torch.arange(size).expand(2, -1))
+    one_place = dp.farthest_point_sample(torch.zeros(8, 3, dtype=dtype), 8, start=2)
+    assert one_place.tolist() == [2, 0, 1, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_each_cloud_has_its_own_number_and_start(monkeypatch, large):
+    if large:
+        monkeypatch.setattr(sampling, "_LARGE", 0)
+    points, lengths = random(2, 2, 50, 3), torch.tensor([[50, 20], [7, 0]])
+    k, start = torch.tensor([[9, 20], [3, 0]]), torch.tensor([[49, 2], [6, 0]])
+    chosen = dp.farthest_point_sample(points, k, start=start, lengths=lengths)
+    assert chosen.shape == (2, 2, 20)
+    assert torch.equal(chosen, reference.farthest_point_sample(points, k, start=start, lengths=lengths))
+    for i, j in ((0, 0), (0, 1), (1, 0)):
+        alone = dp.farthest_point_sample(points[i, j, : lengths[i, j]], int(k[i, j]), start=int(start[i, j]))
+        assert torch.equal(chosen[i, j, : k[i, j]], alone)
+        assert (chosen[i, j, k[i, j] :] == -1).all()
+    assert (chosen[1, 1] == -1).all()
+    with pytest.raises(ValueError, match=r"'k' must be at most 6; got 9 for cloud 1, .*allow_fewer"):
+        dp.farthest_point_sample(points[:, 0], 9, lengths=torch.tensor([50, 6]))
+    with pytest.raises(ValueError, match="'k' must be at least 0; got -2 for cloud 1"):
+        dp.farthest_point_sample(points[0], torch.tensor([3, -2]))
+    with pytest.raises(ValueError, match="'start' must be at most 19; got 20 for cloud 1"):
+        dp.farthest_point_sample(points[0], 3, start=torch.tensor([3, 20]), lengths=lengths[0])
+    with pytest.raises(ValueError, match=r"'k' must have shape \(2,\); got \(3,\)"):
+        dp.farthest_point_sample(points[0], torch.tensor([3, 2, 1]))
+
+
+def test_clouds_with_too_few_points_are_chosen_whole_on_request():
+    points, lengths = random(3, 30, 3), torch.tensor([30, 4, 0])
+    chosen = dp.farthest_point_sample(points, 10, lengths=lengths, allow_fewer=True)
+    assert ((chosen >= 0).sum(-1) == torch.tensor([10, 4, 0])).all()
+    assert chosen[1, :4].sort().values.tolist() == [0, 1, 2, 3]
+    assert dp.farthest_point_sample(torch.zeros(2, 0, 3), 3, allow_fewer=True).tolist() == [[-1] * 3] * 2
+    with pytest.raises(ValueError, match="allow_fewer"):
+        dp.farthest_point_sample(torch.zeros(2, 0, 3), 3)
+
+
+def test_random_starts_are_those_of_the_generator():
+    points, lengths = random(200, 12, 3), torch.tensor([12, 3]).repeat(100)
+
+    def starts(seed: int) -> torch.Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        return dp.farthest_point_sample(points, 2, start="random", lengths=lengths, generator=generator)
+
+    first = starts(0)
+    assert torch.equal(first, starts(0))
+    assert not torch.equal(first, starts(1))
+    assert first[::2, 0].unique().tolist() == [*range(12)]
+    assert first[1::2, 0].unique().tolist() == [0, 1, 2]
+    expected = reference.farthest_point_sample(points, 2, start=first[:, 0], lengths=lengths)
+    assert torch.equal(first, expected)
+    torch.manual_seed(0)
+    again = dp.farthest_point_sample(points, 2, start="random", lengths=lengths)
+    torch.manual_seed(0)
+    assert torch.equal(again, dp.farthest_point_sample(points, 2, start="random", lengths=lengths))
+    with pytest.raises(ValueError, match=r"'start' must be an integer.* or 'random'; got 'farthest'"):
+        dp.farthest_point_sample(points, 2, start="farthest")
+    with pytest.raises(ValueError, match="'generator' must be None without start='random'"):
+        dp.farthest_point_sample(points, 2, generator=torch.Generator())
+
+
 def test_farthest_points_cover_better_than_random_ones():
     points = random(1, 2000, 3)
     chosen = torch.take_along_dim(points, dp.farthest_point_sample(points, 64)[..., None], 1)

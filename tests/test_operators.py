@@ -34,7 +34,14 @@ def operator_arguments() -> dict[str, tuple]:
         "reproject": (depth, camera.back_projection.clone().requires_grad_(), projection, H, W),
         "earth_mover_distance": (a, b, *lengths, torch.zeros(B, N), -torch.ones(B), torch.ones(B), 0.02),
         "approxmatch": (a, b, *lengths, True),
-        "farthest_point_sample": (a.detach(), lengths[0], 3, 0),
+        "farthest_point_sample": (
+            a.detach(),
+            lengths[0],
+            torch.tensor([3, 2]),
+            torch.tensor([0, 1]),
+            -1,
+            False,
+        ),
         "sample_view": (a, dp.splat_depth(a, camera).visible),
         "visible": (a.detach(), lengths[0], projection.detach(), H, W, "horizon", 3.0, 0.4),
     }

@@ -195,12 +195,15 @@ def check_approxmatch(recipes: tuple[strategies.Recipe, strategies.Recipe]) -> s
     return AGREED
 
 
-def check_farthest_point_sample(recipe: strategies.Recipe, k: int, start: int) -> str:
+def check_farthest_point_sample(recipe: strategies.Recipe, k: int, start: int, allow_fewer: bool) -> str:
     cloud = recipe.make()
     smallest = int(cloud.counts.min()) if cloud.counts.numel() else 0
-    refuse = cloud.counts.numel() > 0 and (cloud.poisoned or k > smallest or start > max(smallest - 1, 0))
+    too_many = k > smallest and not allow_fewer
+    refuse = cloud.counts.numel() > 0 and (cloud.poisoned or too_many or start > max(smallest - 1, 0))
     chosen = refuse_or_run(
-        lambda: dp.farthest_point_sample(cloud.points, k, start=start, lengths=cloud.lengths),
+        lambda: dp.farthest_point_sample(
+            cloud.points, k, start=start, lengths=cloud.lengths, allow_fewer=allow_fewer
+        ),
         refuse,
         "farthest_point_sample",
     )
@@ -214,10 +217,14 @@ def check_farthest_point_sample(recipe: strategies.Recipe, k: int, start: int) -
     points, rows = cloud.clean.reshape(batch, recipe.count, 3), chosen.reshape(batch, k)
     for whole, n, row in zip(points, cloud.counts.flatten().tolist(), rows, strict=True):
         real = whole[:n]
+        assert (row[n:] == -1).all()
+        row = row[:n]
+        assert len(row.unique()) == len(row) == min(k, n)
         distance = torch.full((n,), torch.inf, dtype=torch.float64)
         for step, i in enumerate(row.tolist()):
             assert i == start if step == 0 else distance[i] >= distance.max() * (1 - 16 * eps(recipe.dtype))
             if step:
                 assert not (real[:i] == real[i]).all(-1).any() or distance[i] == 0, "the lowest of equals"
             distance = torch.minimum(distance, (real - real[i]).double().square().sum(-1))
+            distance[i] = -1  # none is chosen twice
     return AGREED
