@@ -60,6 +60,8 @@ def register(
     an op without a formula raises an error with its name. The function receives contiguous CPU tensors: arguments on
     other devices or with other strides are copied first, and the results are moved to the device of the arguments.
     With `strided` it also receives tensors that are not contiguous, for instance one number expanded.
+
+    The batch is the first dimension of every tensor, argument or result: `torch.vmap` enlarges it (see `_transforms`).
     """
 
     def decorate(function: Callable) -> Callable[..., Any]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._C import _functorch
 
 FLOATS = (torch.float32, torch.float64)
 
@@ -24,15 +25,14 @@ def readable(*values: Tensor) -> bool:
     """Whether Python can read values of these: not while torch traces, nor where `torch.vmap` maps over them."""
     if torch.compiler.is_compiling():
         return False
-    return torch._C._functorch.maybe_current_level() is None or not any(_is_mapped(v) for v in values)
+    return _functorch.maybe_current_level() is None or not any(_is_mapped(v) for v in values)
 
 
 def _is_mapped(value: Tensor) -> bool:
-    functorch = torch._C._functorch
-    while functorch.is_functorch_wrapped_tensor(value):
-        if functorch.is_batchedtensor(value):
+    while _functorch.is_functorch_wrapped_tensor(value):
+        if _functorch.is_batchedtensor(value):
             return True
-        value = functorch.get_unwrapped(value)
+        value = _functorch.get_unwrapped(value)
     return False
 
 
@@ -40,7 +40,7 @@ def differentiated(*values: Tensor) -> bool:
     """Whether a gradient with respect to one of these may be asked for; in doubt, yes."""
     if not torch.is_grad_enabled():
         return False
-    transformed = torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None
+    transformed = torch.compiler.is_compiling() or _functorch.maybe_current_level() is not None
     return transformed or any(v.requires_grad for v in values)
 
 
@@ -55,13 +55,24 @@ def full_precision(like: Tensor) -> contextlib.AbstractContextManager:
 def check_tensor(function: str, name: str, value: Any, shape: tuple[int | str, ...]) -> Tensor:
     """Type, dtype and shape of a float tensor. A string in `shape` is a free size; "*" any leading sizes."""
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{function}: '{name}' must be a torch.Tensor; got {type(value).__name__}.")
+        raise TypeError(f"{function}: '{name}' must be a torch.Tensor; got {_kind(value)}")
+    if value.is_nested or value.layout is not torch.strided:
+        kind = "nested" if value.is_nested else f"{value.layout}"
+        raise TypeError(
+            f"{function}: '{name}' must be a dense tensor; got a {kind} one. Pad it, or use .to_dense()."
+        )
     if value.dtype not in FLOATS:
         raise TypeError(
             f"{function}: '{name}' must be float32 or float64; got {value.dtype}. Convert it with .float()."
         )
     check_shape(function, name, value, shape)
     return value
+
+
+def _kind(value: Any) -> str:
+    """What a value that is no tensor is, as the end of a message."""
+    hint = " Convert it with torch.from_numpy." if type(value).__name__ == "ndarray" else ""
+    return f"{type(value).__name__}.{hint}"
 
 
 def check_device(function: str, name: str, value: Tensor, like: Tensor) -> None:
@@ -107,8 +118,8 @@ def check_lengths(
     if lengths is None:
         return None
     if not isinstance(lengths, torch.Tensor) or lengths.dtype not in (torch.int64, torch.int32):
-        what = lengths.dtype if isinstance(lengths, torch.Tensor) else type(lengths).__name__
-        raise TypeError(f"{function}: '{name}' must be an integer tensor (int64); got {what}.")
+        what = f"{lengths.dtype}." if isinstance(lengths, torch.Tensor) else _kind(lengths)
+        raise TypeError(f"{function}: '{name}' must be an integer tensor (int64); got {what}")
     if like is not None:
         check_device(function, name, lengths, like)
     if tuple(lengths.shape) != tuple(shape):
@@ -194,14 +205,13 @@ def check_number(
     return float(value)
 
 
-def check_integer(function: str, name: str, value: Any, smallest: int) -> int:
-    """A whole number of Python or numpy, at least `smallest`."""
+def check_integer(function: str, name: str, value: Any, expected: str, smallest: int) -> int:
+    """A whole number of Python or numpy, at least `smallest`; `expected` says it in words."""
     try:
         number = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = None
     if number is None or number < smallest:
-        expected = "be a positive integer" if smallest == 1 else f"be an integer of at least {smallest}"
         raise fail(function, name, expected, repr(value))
     return number
 

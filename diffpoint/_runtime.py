@@ -224,7 +224,7 @@ def configure(*, threads: int | None = None, cache: bool = True) -> None:
         '1'
     """
     if threads is not None:
-        threads = _checks.check_integer("configure", "threads", threads, 1)
+        threads = _checks.check_integer("configure", "threads", threads, "be a positive integer or None", 1)
     with RUNTIME.lock:
         if RUNTIME.program is not None:
             raise RuntimeError(

@@ -53,7 +53,9 @@ class PinholeCamera:
         _checks.check_tensor("PinholeCamera", "cam_from_world", self.cam_from_world, ("*", 4, 4))
         _checks.check_same_dtype("PinholeCamera", K=self.K, cam_from_world=self.cam_from_world)
         for name in ("height", "width"):
-            size = _checks.check_integer("PinholeCamera", name, getattr(self, name), 1)
+            size = _checks.check_integer(
+                "PinholeCamera", name, getattr(self, name), "be a positive integer", 1
+            )
             if size is not getattr(self, name):  # a number of numpy
                 object.__setattr__(self, name, size)
         try:
@@ -144,6 +146,7 @@ class PinholeCamera:
             >>> PinholeCamera.from_opengl(torch.eye(3), gl, 4, 4).position.tolist()
             [0.0, 0.0, 2.0]
         """
+        _checks.check_tensor("PinholeCamera.from_opengl", "cam_from_world", cam_from_world, ("*", 4, 4))
         with _checks.full_precision(cam_from_world):
             flipped = cam_from_world.new_tensor(_FLIP_YZ) @ cam_from_world
         return cls(K, flipped, height, width)
@@ -159,6 +162,8 @@ class PinholeCamera:
             >>> PinholeCamera.from_pytorch3d(R, T, K, 4, 4).position.tolist()
             [0.0, 0.0, -2.0]
         """
+        _checks.check_tensor("PinholeCamera.from_pytorch3d", "R", R, ("*", 3, 3))
+        _checks.check_tensor("PinholeCamera.from_pytorch3d", "T", T, ("*", 3))
         view_from_world = R.new_zeros((*R.shape[:-2], 4, 4))
         view_from_world[..., :3, :3] = R.transpose(-1, -2)
         view_from_world[..., :3, 3] = T
@@ -219,7 +224,13 @@ class PinholeCamera:
         )
 
     def __getitem__(self, item) -> PinholeCamera:
-        """Index the leading dimensions."""
+        """Index the leading dimensions; `camera[:, None]` makes one view for each cloud of N cameras.
+
+        Example:
+            >>> cameras = PinholeCamera(torch.eye(3), torch.eye(4).expand(5, 4, 4), 8, 8)
+            >>> cameras[2].batch_shape, cameras[1:].batch_shape, cameras[:, None].batch_shape
+            ((), (4,), (5, 1))
+        """
         shape = self.batch_shape
         if not shape:
             raise IndexError("PinholeCamera: a single camera has no leading dimension to index.")
@@ -292,7 +303,12 @@ def check_views(
         )
     own = shape[-1] if shape else 1
     if views is not None and own not in (1, views):
-        raise _checks.fail(function, name, f"have {views} views to match 'depth'", str(own))
+        hint = (
+            f"For one camera for each of the {batch} clouds pass {name}[:, None]."
+            if shape == (batch,)
+            else ""
+        )
+        raise _checks.fail(function, name, f"have {views} views to match 'depth'", str(own), hint)
     return Views(camera, (batch, own if views is None else views))
 
 

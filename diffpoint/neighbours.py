@@ -61,7 +61,7 @@ def knn(
         [[1, 2], [0, 2], [1, 0]]
     """
     a3, b3, la, lb, _ = paired_sets("knn", a, b, a_lengths, b_lengths)
-    k = _checks.check_integer("knn", "k", k, 1)
+    k = _checks.check_integer("knn", "k", k, "be a positive integer", 1)
     if radius is None:
         radius = torch.inf
     else:

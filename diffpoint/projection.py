@@ -76,7 +76,9 @@ def projection_loss(
         0.0
     """
     mask_weight = _check("projection_loss", points, camera, depth, mask_weight=mask_weight)
-    upsample = _checks.check_integer("projection_loss", "upsample", upsample, 1)
+    upsample = _checks.check_integer(
+        "projection_loss", "upsample", upsample, "be a whole number of at least 1", 1
+    )
     camera = check_views("projection_loss", "camera", camera, points, views=depth.shape[1]).camera
     if logits is None:
         rendered, index = _pseudo_render(points, camera, upsample=upsample)

@@ -30,7 +30,8 @@ def soft_splat(
         counts = counts & (torch.arange(points.shape[1]) < lengths[:, None])[:, None]
     u, v = torch.where(counts[..., None], pixels, 0.0)[..., None, None, :].unbind(-1)
     fade = 1 - ((columns - u) / radius).square() - ((rows - v) / radius).square()
-    covers = counts[..., None, None] & (fade > 0)
+    rounding = 32 * torch.finfo(points.dtype).eps * (1 + max(size) / radius)  # of the fade
+    covers = counts[..., None, None] & (fade > rounding)
     footprint = torch.where(covers, fade, 0.0).square()
     coverage = footprint.sum(2)
     if points.shape[1] == 0:

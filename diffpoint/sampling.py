@@ -73,7 +73,7 @@ def _integers(name: str, value: int | Tensor, points: Tensor, batch: tuple[int, 
         checked = _checks.check_lengths("farthest_point_sample", name, value, batch, points.shape[1], points)
         assert checked is not None
         return checked.reshape(points.shape[0])
-    number = _checks.check_integer("farthest_point_sample", name, value, 0)
+    number = _checks.check_integer("farthest_point_sample", name, value, "be an integer of at least 0", 0)
     return torch.full((points.shape[0],), number, dtype=torch.int64, device=points.device)
 
 

@@ -38,8 +38,9 @@ def soft_splat(
     """Render clouds with soft footprints and soft depth order, so that gradients reach x and y.
 
     A point at pixel position (u, v) covers the pixels whose centres lie within `radius` of it, with the footprint
-    k = (1 - r^2 / radius^2)^2 at distance r: 1 at the point, 0 at the edge, with a continuous derivative. A pixel's
-    depth is the mean of the depths z on it with weights k exp(-z / softness), its coverage the sum of the k.
+    k = (1 - r^2 / radius^2)^2 at distance r: 1 at the point, 0 at the edge, with a continuous derivative; where k is so
+    small that rounding may have made it, the point does not count. A pixel's depth is the mean of the depths z on it
+    with weights k exp(-z / softness), its coverage the sum of the k.
 
     Args:
         points: (B, N, 3) in the world.
@@ -138,16 +139,26 @@ def _soft_splat(
     """Depth and coverage; then for the backward pass the nearest depth and the sum of the weights."""
     batch, views, count = point_depth.shape
     _checks.check_lengths_range("soft_splat", "lengths", lengths, count)
-    maps = [point_depth.new_empty(batch * views * height * width) for _ in range(4)]
+    depth, coverage, nearest, weight = (
+        point_depth.new_empty((batch, views, height, width)) for _ in range(4)
+    )
+    maps = [m.view(-1) for m in (depth, coverage, nearest, weight)]
     if point_depth.numel():
         inputs = pixels.reshape(-1), point_depth.reshape(-1), lengths
-        sizes = views, count, height, width, radius, softness
+        sizes = views, count, height, width, radius, softness, _least_fade(depth, radius)
         _bridge.launch("soft_splat", "forward", point_depth.dtype, *inputs, *maps, *sizes)
     else:
         for values, empty in zip(maps, (math.inf, 0.0, math.inf, 0.0), strict=True):
             values.fill_(empty)
-    depth, coverage, nearest, weight = (m.view(batch, views, height, width) for m in maps)
     return depth, coverage, nearest, weight
+
+
+def _least_fade(maps: Tensor, radius: float) -> float:
+    """How large 1 - r^2 / radius^2 may be at the edge of a footprint by rounding, on maps (B, V, H, W).
+
+    Such a footprint must not count: in the soft minimum a point in front of the others outweighs it by any factor.
+    """
+    return 32 * torch.finfo(maps.dtype).eps * (1 + max(maps.shape[2:]) / radius)
 
 
 @_bridge.register(
@@ -175,6 +186,6 @@ def _soft_splat_backward(
         inputs = pixels.reshape(-1), point_depth.reshape(-1), lengths
         maps = (m.reshape(-1) for m in (depth, nearest, weight, grad_depth, grad_coverage))
         outputs = grad_pixels.view(-1), grad_point_depth.view(-1)
-        sizes = views, count, *depth.shape[2:], radius, softness
+        sizes = views, count, *depth.shape[2:], radius, softness, _least_fade(depth, radius)
         _bridge.launch("soft_splat", "backward", point_depth.dtype, *inputs, *maps, *outputs, *sizes)
     return grad_pixels, grad_point_depth

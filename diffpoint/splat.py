@@ -58,7 +58,11 @@ def splat_depth(
     """
     _checks.check_clouds("splat_depth", "points", points)
     radius = _checks.check_number(
-        "splat_depth", "radius", radius, "be a finite number of pixels, at least 0", lambda r: 0 <= r < math.inf
+        "splat_depth",
+        "radius",
+        radius,
+        "be a finite number of pixels, at least 0",
+        lambda r: 0 <= r < math.inf,
     )
     batch = points.shape[0]
     lengths = _checks.check_lengths("splat_depth", "lengths", lengths, (batch,), points.shape[1], points)

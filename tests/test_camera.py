@@ -99,3 +99,43 @@ def test_singular_matrices_are_named_where_they_are_inverted():
     nowhere = dp.PinholeCamera(torch.eye(3), torch.diag(torch.tensor([1.0, 1.0, 0.0, 1.0])), 2, 2)
     with pytest.raises(ValueError, match="'cam_from_world' must be invertible"):
         _ = nowhere.position
+
+
+def test_n_cameras_for_n_clouds():
+    """In PyTorch3D these are pairs; here each cloud is seen from all N views, unless the cameras are (N, 1)."""
+    cameras = dp.PinholeCamera.look_at(
+        torch.tensor([[0.0, 0, -2], [2, 0, 0], [0.1, 2, 0]]), focal_px=9.0, height=8, width=8
+    )
+    clouds = torch.rand(3, 5, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    assert dp.project(clouds, cameras).depth.shape == (3, 3, 5)
+    pairs = dp.project(clouds, cameras[:, None])
+    for b in range(3):
+        alone = dp.project(clouds[b : b + 1], cameras[b])
+        torch.testing.assert_close(pairs.pixels[b : b + 1], alone.pixels)
+    depth = dp.splat_depth(clouds, cameras[:, None]).depth
+    with pytest.raises(
+        ValueError, match=r"'camera' must have 1 views .*; got 3\. .* pass camera\[:, None\]\.$"
+    ):
+        dp.unproject(depth, cameras)
+    assert dp.unproject(depth, cameras[:, None]).lengths.shape == (3, 1)
+    with pytest.raises(ValueError, match=r"'camera' must have 1 views to match 'depth'; got 2\.$"):
+        dp.unproject(depth, cameras[:2])
+
+
+def test_intrinsics_of_opencv_are_shifted_by_half_a_pixel():
+    """OpenCV's pixels have their centres at whole numbers; see docs/conventions.md."""
+    opencv = torch.tensor([[30.0, 0, 5.25], [0, 28, 3.5], [0, 0, 1]])
+    points = (
+        torch.rand(1, 40, 3, generator=torch.Generator().manual_seed(0)) - 0.5 + torch.tensor([0, 0, 3.0])
+    )
+    projected = points @ opencv.T
+    position = projected[..., :2] / projected[..., 2:]  # of cv2.projectPoints
+    K = opencv.clone()
+    K[..., :2, 2] += 0.5
+    camera = dp.PinholeCamera(K, torch.eye(4), 8, 12)
+    torch.testing.assert_close(dp.project(points, camera).pixels[0], position + 0.5)
+    index = dp.splat_depth(points, camera).index[0, 0]
+    row, column = (index >= 0).nonzero().unbind(1)
+    nearest_centre = position[0, index[row, column]].round().long()  # the pixel that OpenCV means
+    assert torch.equal(nearest_centre, torch.stack((column, row), 1))
+    assert len(row) > 5

@@ -95,6 +95,33 @@ def test_what_is_no_tensor(op):
         (CLOUDS | SETS)[op]([[0.0, 0.0, 0.0]])
 
 
+@pytest.mark.parametrize("op", CLOUDS | SETS)
+def test_arrays_and_tensors_of_other_layouts(op):
+    call = (CLOUDS | SETS)[op]
+    with pytest.raises(
+        TypeError, match=r"must be a torch\.Tensor; got ndarray\. Convert it with torch\.from_numpy\."
+    ):
+        call(np.zeros((2, 7, 3)))
+    with pytest.raises(TypeError, match=r"must be a dense tensor; got a torch\.sparse_coo one"):
+        call(torch.zeros(2, 7, 3).to_sparse())
+
+
+def test_cameras_of_arrays():
+    K, R, T = np.eye(3), np.eye(3), np.zeros(3)
+    tensor = torch.eye(3, dtype=torch.float64)
+    for name, call in (
+        ("PinholeCamera: 'K'", lambda: dp.PinholeCamera(K, torch.eye(4), 3, 3)),
+        (
+            "PinholeCamera.from_opengl: 'cam_from_world'",
+            lambda: dp.PinholeCamera.from_opengl(K, np.eye(4), 3, 3),
+        ),
+        ("PinholeCamera.from_pytorch3d: 'R'", lambda: dp.PinholeCamera.from_pytorch3d(R, T, K, 3, 3)),
+        ("PinholeCamera.from_pytorch3d: 'T'", lambda: dp.PinholeCamera.from_pytorch3d(tensor, T, K, 3, 3)),
+    ):
+        with pytest.raises(TypeError, match=rf"^{name} must be a torch\.Tensor; got ndarray\. Convert"):
+            call()
+
+
 @pytest.mark.parametrize("op", MAPS)
 def test_depth_maps_of_another_size(op):
     with pytest.raises(ValueError, match="'depth' must have"):
@@ -282,7 +309,10 @@ def test_integers_are_those_of_python_and_numpy(op):
     for number in (np.int64(2), np.int32(2), np.uint8(2)):
         assert all(torch.equal(x, y) for x, y in zip(leaves(call(number)), plain, strict=True))
     for other in (True, np.True_, 2.0, np.float64(2), "2", -1, None):
-        with pytest.raises(ValueError, match=rf"^{op.split()[0]}: '{name}' must be an? (positive )?integer"):
+        with pytest.raises(
+            ValueError,
+            match=rf"^{op.split()[0]}: '{name}' must be an? (positive integer|integer|whole number)",
+        ):
             call(other)
     assert type(dp.PinholeCamera(CAMERA.K, CAMERA.cam_from_world, np.int64(2), 2).height) is int
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import diffpoint as dp
+from diffpoint import reference_projection
 from diffpoint.testing import assert_close, tie_free_clouds
 
 
@@ -213,3 +214,34 @@ def test_the_clouds_of_a_batch_do_not_affect_each_other():
 def test_radius_and_softness_must_be_positive(name, value):
     with pytest.raises(ValueError, match=f"soft_splat: '{name}' must be positive and finite; got"):
         dp.soft_splat(torch.zeros(1, 3, 3), soft_camera(torch.float32), **{name: value})
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_footprint_that_is_only_rounding_does_not_decide_a_depth(dtype):
+    """Two points: one on the middle of a pixel, and one far in front of it whose footprint ends there.
+
+    Rounding gives some of the latter a footprint of 1e-14 on that pixel; in the soft minimum it outweighed the other.
+    """
+    K = torch.tensor([[3.0, 0, 1.5], [0, 3, 0.5], [0, 0, 1]], dtype=dtype)
+    camera = dp.PinholeCamera(K, torch.eye(4, dtype=dtype), 1, 3)
+    front = torch.linspace(1, 2, 2000, dtype=dtype)
+    zero = torch.zeros_like(front)
+    ends = torch.stack(
+        (front / 3, zero, front), -1
+    )  # at u = 2.5, one pixel from the centre of the middle one
+    behind = torch.stack((zero, zero, front + 2), -1)
+    points = torch.stack((behind, ends), 1).requires_grad_()
+    soft = dp.soft_splat(points, camera, radius=1.0, softness=0.01)
+    assert torch.equal(soft.depth[:, 0, 0, 1], behind[:, 2])
+    assert torch.equal(soft.coverage[:, 0, 0, 1], torch.ones_like(front))
+    twin, coverage = reference_projection.soft_splat(
+        points.detach(), K[None, None], camera.cam_from_world[None, None], (1, 3), radius=1.0, softness=0.01
+    )
+    assert torch.equal(coverage[:, 0, 0, 1], torch.ones_like(front))
+    assert torch.equal(twin[:, 0, 0, 1], behind[:, 2])
+    (gradient,) = torch.autograd.grad(soft.depth[..., 1].sum() + soft.coverage[..., 1].sum(), points)
+    assert not gradient[:, 1].any()
+    # and a footprint that is more than rounding counts
+    nearer = ends * torch.tensor([1 - 1e-2, 1, 1], dtype=dtype)
+    points = torch.stack((behind, nearer), 1)
+    assert (dp.soft_splat(points, camera, radius=1.0, softness=0.01).depth[:, 0, 0, 1] < front + 0.1).all()

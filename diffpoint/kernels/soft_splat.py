@@ -1,4 +1,7 @@
-"""Soft splatting: footprints that fade towards their edge, and a soft minimum of the depths where they overlap."""
+"""Soft splatting: footprints that fade towards their edge, and a soft minimum of the depths where they overlap.
+
+A footprint is the square of a fade, 1 at the point and 0 at the edge. Fades up to `least` count as 0.
+"""
 
 from types import SimpleNamespace
 
@@ -44,6 +47,7 @@ def build(real):
         width: ti.i32,
         radius: real,
         softness: real,
+        least: real,
         spread: ti.i32,
     ):
         """One thread per map. Weights are relative to the nearest depth so far: a nearer point rescales them."""
@@ -69,7 +73,7 @@ def build(real):
                         for column in range(bounds[0], bounds[1]):
                             du = (ti.cast(column, real) + real(0.5) - u) / radius
                             fade = one - du * du - dv * dv
-                            if fade > zero:
+                            if fade > least:
                                 p = start + row * width + column
                                 footprint = fade * fade
                                 front = nearest[p]
@@ -103,6 +107,7 @@ def build(real):
         width: ti.i32,
         radius: real,
         softness: real,
+        least: real,
         spread: ti.i32,
     ):
         """One thread per view gathers from the pixels of its points."""
@@ -131,7 +136,7 @@ def build(real):
                         for column in range(bounds[0], bounds[1]):
                             du = (ti.cast(column, real) + real(0.5) - u) / radius
                             fade = one - du * du - dv * dv
-                            if fade > zero:
+                            if fade > least:
                                 p = start + row * width + column
                                 g = grad_coverage[p]
                                 share = ti.exp((nearest[p] - d) / softness)

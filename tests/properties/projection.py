@@ -36,14 +36,17 @@ def _footprints(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Footprint, its possible error, depth and its possible error (B, V, N, H, W), in float64."""
     at = image_bounds(cloud.clean, *camera_matrices(camera, len(cloud.points)))
+    least = (
+        32 * eps(cloud.points.dtype) * (1 + max(camera.height, camera.width) / radius)
+    )  # smaller fades do not count
     u, v, depth, du, dv, dd = (t[..., None, None] for t in at)
     across = torch.arange(camera.width, dtype=torch.float64)[None, :] + 0.5 - u
     down = torch.arange(camera.height, dtype=torch.float64)[:, None] + 0.5 - v
     inside = (torch.arange(u.shape[2]) < cloud.counts[:, None])[:, None, :, None, None]
 
     def footprint(across: Tensor, down: Tensor, counts: Tensor) -> Tensor:
-        fade = (1 - (across / radius).square() - (down / radius).square()).clamp(min=0)
-        return torch.where(counts & inside, fade.square(), 0.0)
+        fade = 1 - (across / radius).square() - (down / radius).square()
+        return torch.where(counts & inside & (fade > least), fade.square(), 0.0)
 
     nearest = footprint((across.abs() - du).clamp(min=0), (down.abs() - dv).clamp(min=0), depth > -dd)
     farthest = footprint(across.abs() + du, down.abs() + dv, depth > dd)
@@ -74,12 +77,13 @@ def check_soft_splat(case: Rendering, softness: float) -> str:
     if case.recipe.count == 0:
         return AGREED
     order = ((torch.where(footprint > 0, z, torch.inf).amin(2, keepdim=True) - z) / softness).exp()
+    maybe = torch.where(error > 0, order, 0.0)  # of the points whose footprint may only be rounding
     order = torch.where(footprint > 0, order, 0.0)
     weight = (footprint * order).sum(2)
     depth = (footprint * order * torch.where(footprint > 0, z, 0.0)).sum(2) / weight
     # What each point may add to the sum of weights, relative to it: by its footprint, and by its place in the order.
     per_point = order * (error + 2 * footprint * (dz.expand_as(footprint) / softness + rounding))
-    loose = torch.where(footprint > 0, per_point, error).sum(2) / weight
+    loose = torch.where(footprint > 0, per_point, error * maybe).sum(2) / weight
     certain = torch.isfinite(loose) & (loose < 0.01) & (weight > 0)
     reach = torch.where(footprint + error > 0, (z - depth[:, :, None]).abs(), 0.0).amax(2)
     widest = torch.where(footprint + error > 0, dz.expand_as(footprint), 0.0).amax(2)
