@@ -1,5 +1,8 @@
 """Differentiable point-cloud rendering and shape distances for PyTorch, fast on a plain CPU."""
 
+import torch as _torch
+
+from diffpoint._conversions import OpenGLCamera, PyTorch3DCamera
 from diffpoint._runtime import RuntimeInfo, configure, runtime_info
 from diffpoint.camera import PinholeCamera, PointSets, Projection
 from diffpoint.distances import Chamfer, FScore, Nearest, chamfer_distance, f_score, nearest
@@ -32,9 +35,11 @@ __all__ = [
     "FrontTerms",
     "Nearest",
     "Neighbours",
+    "OpenGLCamera",
     "PinholeCamera",
     "PointSets",
     "Projection",
+    "PyTorch3DCamera",
     "Reprojection",
     "RuntimeInfo",
     "SoftSplat",
@@ -65,3 +70,7 @@ __all__ = [
     "unproject",
     "visible_points",
 ]
+
+# Like cameras, results may be in files that torch.load reads with weights_only=True.
+_classes = [item for item in map(globals().get, __all__) if isinstance(item, type)]
+_torch.serialization.add_safe_globals([item for item in _classes if issubclass(item, tuple)])
