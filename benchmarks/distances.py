@@ -1,4 +1,4 @@
-"""Races of `nearest`, `chamfer_distance` and `consistency_loss`."""
+"""Races of `nearest`, `knn`, `chamfer_distance` and `consistency_loss`."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from benchmarks.peers import each, keops, optional
 
 def races() -> Iterator[Race]:
     yield from _nearest(16, 2048, 2048)
+    yield from _knn(80, 2048, 2048, 8)
+    yield from _knn(2, 16384, 16384, 8)
     yield from _chamfer(80, 2048, 2048)
     yield from _chamfer(8, 16384, 2048)
     yield from _chamfer(2, 16384, 16384, directions=("forward",))
@@ -33,6 +35,37 @@ def _nearest(count: int, n: int, m: int) -> Iterator[Race]:
     size = f"{count} x {n} x {m}"
     yield from both_directions(
         "nearest, both ways", size, pairs(count, n, m), ours, [peer], directions=("forward",), units=count
+    )
+
+
+def _knn(count: int, n: int, m: int, k: int) -> Iterator[Race]:
+    a, b = pairs(count, n, m)  # compared are the mean distances to the first neighbour, the second and so on
+    peers = [Way("torch cdist + topk", lambda x, y: torch_peers.knn(x, y, k), lambda r: r.mean(1))]
+    for name, search, distance in _single_searches(k):
+        found = _in_one_direction(search, a.numpy(), b.numpy())
+        peers.append(
+            Way(name, found, lambda r, d=distance: torch.stack([torch.from_numpy(d(x)).mean(0) for x in r]))
+        )
+    if ops := optional("pytorch3d.ops"):
+        peers.append(
+            Way("pytorch3d", lambda x, y: ops.knn_points(x, y, K=k), lambda r: r.dists.sqrt().mean(1))
+        )
+    if (module := keops()) and n <= 4096:  # it tries every pair
+
+        def lazy(x: Tensor, y: Tensor) -> Any:
+            matrix = (module.LazyTensor(x[:, :, None]) - module.LazyTensor(y[:, None])).square().sum(-1)
+            return matrix.Kmin_argKmin(k, dim=2)
+
+        peers.append(Way("pykeops", lazy, lambda r: r[0].sqrt().mean(1)))
+    yield from both_directions(
+        "knn",
+        f"{count} x {n} x {m}, k = {k}",
+        (a, b),
+        Way("diffpoint", lambda x, y: dp.knn(x, y, k), lambda r: r.squared_distance.sqrt().mean(1)),
+        peers,
+        directions=("forward",),
+        units=count,
+        tolerance=1e-3,
     )
 
 
@@ -61,35 +94,49 @@ def _chamfer(count: int, n: int, m: int, **options: Any) -> Iterator[Race]:
     )
 
 
-def _searches(a: Tensor, b: Tensor) -> Iterator[Way]:
-    """Libraries that search in both directions and return distances and indices, of which the user takes means."""
-    count, n = a.shape[:2]
-    a_numpy, b_numpy = a.numpy(), b.numpy()
+Search = Callable[[np.ndarray, np.ndarray], Any]
 
-    def both(search: Callable[[np.ndarray, np.ndarray], Any]) -> Callable[..., list[Any]]:
-        return lambda *_: each(
-            count, lambda i: (search(a_numpy[i], b_numpy[i]), search(b_numpy[i], a_numpy[i]))
-        )
 
-    def means(distance: Callable[[Any], np.ndarray]) -> Callable[[list[Any]], Tensor]:
-        return lambda results: torch.tensor([float(np.mean(distance(forward))) for forward, _ in results])
-
+def _single_searches(k: int) -> Iterator[tuple[str, Search, Callable[[Any], np.ndarray]]]:
+    """Libraries that search one cloud for k neighbours: name, search, and the distances (N, k) of its result."""
     if tree := optional("scipy.spatial"):
         workers = os.cpu_count() or 1
-        search = both(lambda x, y: tree.cKDTree(y).query(x, workers=workers))
-        yield Way("scipy cKDTree", search, means(lambda r: r[0]))
+
+        def query(x: np.ndarray, y: np.ndarray):
+            return tree.cKDTree(y).query(x, k=k, workers=workers)
+
+        yield "scipy cKDTree", query, lambda r: r[0].reshape(-1, k)
     if pcu := optional("point_cloud_utils"):
-        search = both(lambda x, y: pcu.k_nearest_neighbors(x, y, 1))
-        yield Way("point-cloud-utils", search, means(lambda r: r[0]))
+        yield (
+            "point-cloud-utils",
+            lambda x, y: pcu.k_nearest_neighbors(x, y, k),
+            lambda r: r[0].reshape(-1, k),
+        )
     if open3d := optional("open3d"):
         core = open3d.core
 
         def knn(x: np.ndarray, y: np.ndarray):
             index = core.nns.NearestNeighborSearch(core.Tensor.from_numpy(y))
             index.knn_index()
-            return index.knn_search(core.Tensor.from_numpy(x), 1)
+            return index.knn_search(core.Tensor.from_numpy(x), k)
 
-        yield Way("open3d", both(knn), means(lambda r: np.sqrt(r[1].numpy())))
+        yield "open3d", knn, lambda r: np.sqrt(r[1].numpy()).reshape(-1, k)
+
+
+def _in_one_direction(search: Search, a: np.ndarray, b: np.ndarray) -> Callable[..., list[Any]]:
+    return lambda *_: each(len(a), lambda i: search(a[i], b[i]))
+
+
+def _searches(a: Tensor, b: Tensor) -> Iterator[Way]:
+    """Libraries that search in both directions and return distances and indices, of which the user takes means."""
+    n = a.shape[1]
+    for name, search, distance in _single_searches(1):
+        there, back = (_in_one_direction(search, x.numpy(), y.numpy()) for x, y in ((a, b), (b, a)))
+        yield Way(
+            name,
+            lambda *_, there=there, back=back: (there(), back()),
+            lambda r, d=distance: torch.tensor([float(np.mean(d(x))) for x in r[0]]),
+        )
     if (module := keops()) and n <= 4096:  # it tries every pair
 
         def lazy(x: Tensor, y: Tensor) -> tuple[Any, Any]:

@@ -27,6 +27,7 @@ def targets(results: dict[str, Any]) -> list[Target]:
     splat, small = "splat_depth", "80 x 2048, 56 x 56"
     own = "earth_mover_distance 160 x 2048, forward, per pair", "earth_mover_distance", "160 x 2048"
     return [
+        _faster(rows, "knn", "80 x 2048 x 2048, k = 8", forward, 3.0),
         _faster(rows, "chamfer_distance", "80 x 2048 x 2048", forward, 3.5),
         _faster(rows, "chamfer_distance", "80 x 2048 x 2048", backward, 15.0, peer="torch"),
         _faster(rows, "chamfer_distance", "8 x 16384 x 2048", forward, 4.0),

@@ -22,6 +22,12 @@ def nearest_both(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return d_ab, i_ab, d_ba, i_ba
 
 
+def knn(a: Tensor, b: Tensor, k: int) -> Tensor:
+    """Distances (B, N, k), ascending."""
+    parts = zip(a.split(CHUNK), b.split(CHUNK), strict=True)
+    return torch.cat([torch.cdist(x, y).topk(k, largest=False).values for x, y in parts])
+
+
 def chamfer(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Mean distances (B) of both directions; the gradient flows through gathered neighbours, not the matrix."""
     with torch.no_grad():

@@ -1,9 +1,12 @@
 """Differentiable point-cloud rendering and shape distances for PyTorch, fast on a plain CPU."""
 
+import torch as _torch
+
 from diffpoint._bridge import check_pending
+from diffpoint._conversions import OpenGLCamera, PyTorch3DCamera
 from diffpoint._runtime import RuntimeInfo, configure, runtime_info
 from diffpoint.camera import PinholeCamera, PointSets, Projection
-from diffpoint.distances import Chamfer, Nearest, chamfer_distance, nearest
+from diffpoint.distances import Chamfer, FScore, Nearest, chamfer_distance, f_score, nearest
 from diffpoint.losses import (
     FrontSets,
     FrontTerms,
@@ -13,6 +16,7 @@ from diffpoint.losses import (
     front_sets,
     front_terms,
 )
+from diffpoint.neighbours import Neighbours, knn
 from diffpoint.projection import projection_loss, soft_projection_loss
 from diffpoint.reproject import Reprojection, project, reproject, unproject
 from diffpoint.sampling import farthest_point_sample
@@ -27,12 +31,16 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Chamfer",
+    "FScore",
     "FrontSets",
     "FrontTerms",
     "Nearest",
+    "Neighbours",
+    "OpenGLCamera",
     "PinholeCamera",
     "PointSets",
     "Projection",
+    "PyTorch3DCamera",
     "Reprojection",
     "RuntimeInfo",
     "SoftSplat",
@@ -46,10 +54,12 @@ __all__ = [
     "consistency_loss",
     "diversity_loss",
     "earth_mover_distance",
+    "f_score",
     "farthest_point_sample",
     "front_constraint",
     "front_sets",
     "front_terms",
+    "knn",
     "nearest",
     "project",
     "projection_loss",
@@ -62,3 +72,7 @@ __all__ = [
     "unproject",
     "visible_points",
 ]
+
+# Like cameras, results may be in files that torch.load reads with weights_only=True.
+_classes = [item for item in map(globals().get, __all__) if isinstance(item, type)]
+_torch.serialization.add_safe_globals([item for item in _classes if issubclass(item, tuple)])

@@ -230,23 +230,37 @@ def check_depth(function: str, name: str, depth: Tensor) -> None:
         )
 
 
-def check_picks(lengths: Tensor, size: int, k: int, start: int) -> None:
-    """Lengths in range, and no cloud smaller than what `farthest_point_sample` is asked for."""
-    smallest = int(lengths.min()) if len(lengths) else size
+def check_picks(lengths: Tensor, size: int, counts: Tensor, starts: Tensor, *, allow_fewer: bool) -> None:
+    """The values of the arguments of `farthest_point_sample`."""
     check_lengths_range("farthest_point_sample", "lengths", lengths, size)
-    for name, value, limit in (("k", k, smallest), ("start", start, max(smallest - 1, 0))):
-        if value > limit and len(lengths):
-            raise fail(
-                "farthest_point_sample",
-                name,
-                f"be at most {limit} (the smallest cloud has {smallest} points)",
-                str(value),
-            )
+    hint = "Pass allow_fewer=True to choose all points of a smaller cloud." if not allow_fewer else ""
+    _check_at_most("k", counts, torch.full_like(counts, 2**31 - 1) if allow_fewer else lengths, lengths, hint)
+    _check_at_most("start", starts, (lengths - 1).clamp(min=0), lengths, "")
+
+
+def _check_at_most(name: str, values: Tensor, largest: Tensor, lengths: Tensor, hint: str) -> None:
+    wrong = ((values < 0) | (values > largest)).nonzero()
+    if len(wrong):
+        cloud = int(wrong[0])
+        value, limit = int(values[cloud]), int(largest[cloud])
+        expected = "be at least 0" if value < 0 else f"be at most {limit}"
+        got = f"{value} for cloud {cloud}, which has {int(lengths[cloud])} points"
+        raise fail("farthest_point_sample", name, expected, got, hint)
 
 
 def check_clouds(function: str, name: str, value: Any) -> Tensor:
     """A batch of clouds (B, N, 3)."""
     return check_tensor(function, name, value, ("B", "N", 3))
+
+
+def check_points(function: str, name: str, value: Any, size: str) -> Tensor:
+    """Points (*, size, 3), or (*, size, 2) in a plane; these are returned with a third coordinate of 0."""
+    check_tensor(function, name, value, ("*", size, "3 or 2"))
+    if value.shape[-1] == 2:
+        return torch.nn.functional.pad(value, (0, 1))
+    hint = f"The last size must be 3, or 2 for points in a plane, not {value.shape[-1]}."
+    check_shape(function, name, value, ("*", size, 3), hint)
+    return value
 
 
 def check_number(

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.data._utils.collate import default_collate_fn_map
 
-from diffpoint import _checks
-
-_FLIP_YZ = ((1.0, 0, 0, 0), (0, -1.0, 0, 0), (0, 0, -1.0, 0), (0, 0, 0, 1.0))
-_FLIP_XY = ((-1.0, 0, 0, 0), (0, -1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, 1.0))
+from diffpoint import _checks, _conversions
+from diffpoint._conversions import OpenGLCamera, PyTorch3DCamera
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,10 +51,7 @@ class PinholeCamera:
         _checks.check_tensor("PinholeCamera", "K", self.K, ("*", 3, 3))
         _checks.check_tensor("PinholeCamera", "cam_from_world", self.cam_from_world, ("*", 4, 4))
         _checks.check_same_dtype("PinholeCamera", K=self.K, cam_from_world=self.cam_from_world)
-        for name in ("height", "width"):
-            size = _checks.check_integer(
-                "PinholeCamera", name, getattr(self, name), "be a positive integer", 1
-            )
+        for name, size in _sizes("PinholeCamera", self.height, self.width).items():
             if size is not getattr(self, name):  # a number of numpy
                 object.__setattr__(self, name, size)
         try:
@@ -91,25 +87,23 @@ class PinholeCamera:
         eye: Tensor | tuple[float, float, float],
         target: Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
         *,
-        focal_px: float,
         height: int,
         width: int,
+        focal_px: float | None = None,
+        fov_y_deg: float | None = None,
         up: Tensor | tuple[float, float, float] = (0.0, 1.0, 0.0),
     ) -> PinholeCamera:
         """Cameras at `eye` (..., 3) that look at `target`, `up` pointing up in the image; centre in the middle.
+
+        The focal length is given in pixels, or by the vertical field of view in degrees.
 
         Example:
             >>> PinholeCamera.look_at((2.0, 0, 0), focal_px=100.0, height=8, width=8).cam_from_world[2].tolist()
             [-1.0, 0.0, 0.0, 2.0]
         """
-        focal_px = _checks.check_number(
-            "PinholeCamera.look_at",
-            "focal_px",
-            focal_px,
-            "be finite and not 0",
-            lambda f: math.isfinite(f) and f != 0,
-            "To differentiate with respect to a focal length, make the matrix yourself: PinholeCamera(K, ...).",
-        )
+        name = "PinholeCamera.look_at"
+        sizes = _sizes(name, height, width)
+        focal_px = _conversions.focal_of(name, focal_px, fov_y_deg, sizes["height"])
         at = _vector("eye", eye)
         at, towards, upward = torch.broadcast_tensors(
             at, _vector("target", target, at), _vector("up", up, at)
@@ -135,10 +129,44 @@ class PinholeCamera:
         with _checks.full_precision(at):
             cam_from_world[..., :3, 3] = -(rotation @ at[..., None])[..., 0]
         cam_from_world[..., 3, 3] = 1
-        K = at.new_tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]]).expand(
-            *at.shape[:-1], 3, 3
-        )
-        return cls(K, cam_from_world, height, width)
+        K = _conversions.centred_intrinsics(focal_px, **sizes, like=at)
+        return cls(K.expand(*at.shape[:-1], 3, 3), cam_from_world, **sizes)
+
+    @classmethod
+    def from_fov(cls, cam_from_world: Tensor, fov_y_deg: float, height: int, width: int) -> PinholeCamera:
+        """From the vertical field of view in degrees: square pixels, the principal point in the middle.
+
+        Example:
+            >>> PinholeCamera.from_fov(torch.eye(4), 90.0, height=48, width=64).K[0].tolist()
+            [24.0, 0.0, 32.0]
+        """
+        name = "PinholeCamera.from_fov"
+        _checks.check_tensor(name, "cam_from_world", cam_from_world, ("*", 4, 4))
+        sizes = _sizes(name, height, width)
+        focal_px = _conversions.focal_of(name, None, fov_y_deg, sizes["height"])
+        K = _conversions.centred_intrinsics(focal_px, **sizes, like=cam_from_world)
+        return cls(K.expand(*cam_from_world.shape[:-2], 3, 3), cam_from_world, **sizes)
+
+    @classmethod
+    def from_opencv(
+        cls, K: Tensor, R: Tensor, t: Tensor, height: int, width: int, *, pixel_centres: str = "integer"
+    ) -> PinholeCamera:
+        """From X_cam = R X_world + t, with R (..., 3, 3), t (..., 3) and K (..., 3, 3) in pixels, without distortion.
+
+        `pixel_centres` says what K means by the image position (0, 0): "integer", as in OpenCV and Open3D, the centre
+        of the upper left pixel; "half", as in COLMAP and here, its corner. The former is moved by half a pixel.
+
+        Example:
+            >>> K = torch.tensor([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]])  # centred, in OpenCV's pixels
+            >>> PinholeCamera.from_opencv(K, torch.eye(3), torch.zeros(3), 48, 64).K[:2, 2].tolist()
+            [32.0, 24.0]
+        """
+        name = "PinholeCamera.from_opencv"
+        _checks.check_tensor(name, "K", K, ("*", 3, 3))
+        _checks.check_choice(name, "pixel_centres", pixel_centres, ("integer", "half"))
+        if pixel_centres == "integer":
+            K = K + K.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        return cls(K, _conversions.rigid(name, R, t, ("R", "t")), height, width)
 
     @classmethod
     def from_opengl(cls, K: Tensor, cam_from_world: Tensor, height: int, width: int) -> PinholeCamera:
@@ -150,30 +178,84 @@ class PinholeCamera:
             [0.0, 0.0, 2.0]
         """
         _checks.check_tensor("PinholeCamera.from_opengl", "cam_from_world", cam_from_world, ("*", 4, 4))
-        with _checks.full_precision(cam_from_world):
-            flipped = cam_from_world.new_tensor(_FLIP_YZ) @ cam_from_world
-        return cls(K, flipped, height, width)
+        return cls(K, _conversions.flipped(cam_from_world, _conversions.FLIP_YZ), height, width)
 
     @classmethod
     def from_pytorch3d(cls, R: Tensor, T: Tensor, K: Tensor, height: int, width: int) -> PinholeCamera:
         """From PyTorch3D's `R` (..., 3, 3), `T` (..., 3): X_view = X_world R + T, x left, y up, z forward.
 
-        `K` is the OpenCV matrix in pixels (PyTorch3D's `cameras_from_opencv_projection` is the inverse).
+        `K` is the matrix in pixels as here; `to_pytorch3d` is the inverse. Leading dimensions are broadcast.
 
         Example:
             >>> R, T, K = torch.eye(3), torch.tensor([0.0, 0.0, 2.0]), torch.eye(3)
             >>> PinholeCamera.from_pytorch3d(R, T, K, 4, 4).position.tolist()
             [0.0, 0.0, -2.0]
         """
-        _checks.check_tensor("PinholeCamera.from_pytorch3d", "R", R, ("*", 3, 3))
-        _checks.check_tensor("PinholeCamera.from_pytorch3d", "T", T, ("*", 3))
-        view_from_world = R.new_zeros((*R.shape[:-2], 4, 4))
-        view_from_world[..., :3, :3] = R.transpose(-1, -2)
-        view_from_world[..., :3, 3] = T
-        view_from_world[..., 3, 3] = 1
-        with _checks.full_precision(R):
-            flipped = R.new_tensor(_FLIP_XY) @ view_from_world
-        return cls(K, flipped, height, width)
+        name = "PinholeCamera.from_pytorch3d"
+        _checks.check_tensor(name, "R", R, ("*", 3, 3))
+        view_from_world = _conversions.rigid(name, R.mT, T, ("R", "T"))
+        return cls(K, _conversions.flipped(view_from_world, _conversions.FLIP_XY), height, width)
+
+    def to_opengl(self) -> OpenGLCamera:
+        """The view matrix in OpenGL's axes, and K; the inverse of `from_opengl`.
+
+        Example:
+            >>> camera = PinholeCamera.look_at((0, 0, 2.0), fov_y_deg=60.0, height=4, width=4)
+            >>> camera.to_opengl().cam_from_world[:3, 3].tolist()
+            [0.0, 0.0, -2.0]
+        """
+        return OpenGLCamera(self.K, _conversions.flipped(self.cam_from_world, _conversions.FLIP_YZ))
+
+    def to_pytorch3d(self, *, in_ndc: bool = False) -> PyTorch3DCamera:
+        """The arguments of PyTorch3D's `PerspectiveCameras`; all leading dimensions become its one, N.
+
+        Pass them as `PerspectiveCameras(**camera.to_pytorch3d()._asdict(), in_ndc=False)`: focal lengths and principal
+        points in pixels (its screen space); or in its normalised device coordinates with `in_ndc=True` in both calls.
+
+        Example:
+            >>> camera = PinholeCamera.look_at((0, 0, -2.0), focal_px=100.0, height=40, width=80)
+            >>> camera.to_pytorch3d().principal_point.tolist(), camera.to_pytorch3d(in_ndc=True).focal_length.tolist()
+            ([[40.0, 20.0]], [[5.0, 5.0]])
+        """
+        whole = self.expand(*self.batch_shape)
+        K, cam_from_world = whole.K.reshape(-1, 3, 3), whole.cam_from_world.reshape(-1, 4, 4)
+        return _conversions.to_pytorch3d(K, cam_from_world, self.height, self.width, in_ndc)
+
+    @classmethod
+    def stack(cls, cameras: Sequence[PinholeCamera], dim: int = 0) -> PinholeCamera:
+        """Cameras of one image size and batch shape along a new leading dimension.
+
+        Example:
+            >>> one = PinholeCamera.look_at((0, 0, -2.0), focal_px=9.0, height=4, width=4)
+            >>> PinholeCamera.stack([one, one, one]).batch_shape
+            (3,)
+        """
+        name = "PinholeCamera.stack"
+        cameras = list(cameras)
+        if not cameras:
+            raise _checks.fail(name, "cameras", "hold at least one camera", "none")
+        for i, camera in enumerate(cameras):
+            if not isinstance(camera, PinholeCamera):
+                raise TypeError(
+                    f"{name}: 'cameras[{i}]' must be a PinholeCamera; got {type(camera).__name__}."
+                )
+            for what, convert in _ALIKE.items():
+                own, first = (getattr(c, what) for c in (camera, cameras[0]))
+                if own != first:
+                    raise _checks.fail(
+                        name, f"cameras[{i}]", f"have the {what} of the first, {first}", str(own), convert
+                    )
+            _checks.check_device(name, f"cameras[{i}]", camera.K, cameras[0].K)
+        shape = cameras[0].batch_shape
+        if not -len(shape) - 1 <= dim <= len(shape):
+            raise _checks.fail(name, "dim", f"lie in [{-len(shape) - 1}, {len(shape)}]", repr(dim))
+        dim = dim % (len(shape) + 1)
+        whole = [c.expand(*shape) for c in cameras]
+        return dataclasses.replace(
+            cameras[0],
+            K=torch.stack([c.K for c in whole], dim),
+            cam_from_world=torch.stack([c.cam_from_world for c in whole], dim),
+        )
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -209,8 +291,9 @@ class PinholeCamera:
 
     def resize(self, height: int, width: int) -> PinholeCamera:
         """The same view on a map of another size: K's rows are scaled by the ratio of the sizes."""
-        scale = self.K.new_tensor([width / self.width, height / self.height, 1.0])
-        return PinholeCamera(self.K * scale[:, None], self.cam_from_world, height, width)
+        sizes = _sizes("PinholeCamera.resize", height, width)
+        scale = self.K.new_tensor([sizes["width"] / self.width, sizes["height"] / self.height, 1.0])
+        return PinholeCamera(self.K * scale[:, None], self.cam_from_world, **sizes)
 
     def to(self, *args, **kwargs) -> PinholeCamera:
         """As `torch.Tensor.to`, on both matrices."""
@@ -239,6 +322,45 @@ class PinholeCamera:
             raise IndexError("PinholeCamera: a single camera has no leading dimension to index.")
         whole = self.expand(*shape)
         return dataclasses.replace(self, K=whole.K[item], cam_from_world=whole.cam_from_world[item])
+
+    def __len__(self) -> int:
+        """The first leading dimension."""
+        if not self.batch_shape:
+            raise TypeError("PinholeCamera: a single camera has no length; camera[None] is a batch of one.")
+        return self.batch_shape[0]
+
+    def __bool__(self) -> bool:
+        """True, also of a single camera, which has no length, and of a batch of none."""
+        return True
+
+    def __iter__(self) -> Iterator[PinholeCamera]:
+        """The cameras along the first leading dimension."""
+        return iter([self[i] for i in range(len(self))])
+
+
+_ALIKE = {
+    "height": "Resize it with .resize(height, width).",
+    "width": "Resize it with .resize(height, width).",
+    "dtype": "Convert it with .to(dtype).",
+    "batch_shape": "Expand it with .expand(...).",
+}
+"""What stacked cameras must share, and how to achieve it."""
+
+
+def _collate(batch: Sequence[PinholeCamera], *, collate_fn_map=None) -> PinholeCamera:
+    return PinholeCamera.stack(batch)
+
+
+# So that samples of a data set may hold cameras, and files that torch.load reads with weights_only=True.
+default_collate_fn_map[PinholeCamera] = _collate
+torch.serialization.add_safe_globals([PinholeCamera])
+
+
+def _sizes(function: str, height: object, width: object) -> dict[str, int]:
+    return {
+        name: _checks.check_integer(function, name, size, "be a positive integer", 1)
+        for name, size in (("height", height), ("width", width))
+    }
 
 
 @functools.cache

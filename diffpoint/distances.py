@@ -25,12 +25,28 @@ class Nearest(NamedTuple):
 
 
 class Chamfer(NamedTuple):
-    """Both directions of the chamfer distance, each a mean over its own set."""
+    """Both directions of the chamfer distance, each reduced over its own set."""
 
     a_to_b: Tensor
-    """(*B)"""
+    """(*B); (*B, N) with reduction "none", 0 in the padding."""
     b_to_a: Tensor
-    """(*B)"""
+    """(*B); (*B, M) with reduction "none", 0 in the padding."""
+
+    @property
+    def total(self) -> Tensor:
+        """a_to_b + b_to_a (*B); meant for means and sums. The larger direction is `torch.maximum(*chamfer)`."""
+        return self.a_to_b + self.b_to_a
+
+
+class FScore(NamedTuple):
+    """How much of two clouds lies near the other one; values in [0, 1]."""
+
+    f_score: Tensor
+    """(*B) harmonic mean of precision and recall; 0 where both are 0."""
+    precision: Tensor
+    """(*B) share of the points of `a` that have a point of `b` within the threshold."""
+    recall: Tensor
+    """(*B) share of the points of `b` that have a point of `a` within the threshold."""
 
 
 def nearest(
@@ -39,8 +55,8 @@ def nearest(
     """d2_i = min_j |a_i - b_j|^2 and the j of the minimum (the lowest in a tie).
 
     Args:
-        a: (*B, N, 3) points, any unit.
-        b: (*B, M, 3) points, same unit, dtype and leading dimensions.
+        a: (*B, N, 3) or (*B, N, 2) points, any unit.
+        b: (*B, M, 3) or (*B, M, 2) points, same unit, dtype and leading dimensions.
         a_lengths: (*B) int64, how many of the N points count; default all.
         b_lengths: (*B) int64, how many of the M points count; default all.
 
@@ -60,20 +76,31 @@ def nearest(
 
 
 def chamfer_distance(
-    a: Tensor, b: Tensor, *, squared: bool, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+    a: Tensor,
+    b: Tensor,
+    *,
+    squared: bool,
+    reduction: str = "mean",
+    a_lengths: Tensor | None = None,
+    b_lengths: Tensor | None = None,
 ) -> Chamfer:
     """mean_i min_j |a_i - b_j| and mean_j min_i |a_i - b_j|, or the same of squared distances.
 
-    Papers differ in squares, sums and factors, so `squared` has no default and the directions are not added up.
+    Papers differ in squares, sums and factors, so `squared` has no default and both directions are returned; `.total`
+    is their sum.
 
     Args:
-        a: (*B, N, 3) points, any unit.
-        b: (*B, M, 3) points, same unit, dtype and leading dimensions.
+        a: (*B, N, 3) or (*B, N, 2) points, any unit.
+        b: (*B, M, 3) or (*B, M, 2) points, same unit, dtype and leading dimensions.
         squared: True for squared distances (unit^2), False for distances (unit).
+        reduction: over the points of each cloud: "mean"; "sum"; "max", the directed Hausdorff distances, of which
+            `torch.maximum(*chamfer)` is the Hausdorff distance; or "none" for the distance of each point, for instance
+            to weight them. There is none over the batch.
         a_lengths: (*B) int64, how many of the N points count; default all.
         b_lengths: (*B) int64, how many of the M points count; default all.
 
-    Gradients: to `a` and `b`, with the assignments held fixed; 0 for a pair at distance 0.
+    Gradients: to `a` and `b`, with the assignments held fixed; 0 for a pair at distance 0. With "max", to the points of
+        the largest distance, in equal shares if there are several.
 
     Raises:
         ValueError, TypeError: wrong shapes, dtypes or devices, an empty set, NaN or infinite coordinates.
@@ -84,15 +111,68 @@ def chamfer_distance(
         [1.0, 3.0]
     """
     a3, b3, la, lb, batch = paired_sets("chamfer_distance", a, b, a_lengths, b_lengths)
+    _checks.check_choice("chamfer_distance", "reduction", reduction, ("mean", "sum", "max", "none"))
     from_a, _, from_b, _ = _nearest_both(a3, b3, la, lb)
-    a_to_b = _mean_distance(from_a, la, squared)
-    b_to_a = _mean_distance(from_b, lb, squared)
-    return Chamfer(a_to_b.reshape(batch), b_to_a.reshape(batch))
+    directions = []
+    for squared_distance, lengths in ((from_a, la), (from_b, lb)):
+        d = _reduced(squared_distance if squared else safe_sqrt(squared_distance), lengths, reduction)
+        directions.append(d.reshape(batch + tuple(d.shape[1:])))
+    return Chamfer(*directions)
 
 
-def _mean_distance(squared_distance: Tensor, lengths: Tensor, squared: bool) -> Tensor:
-    d = squared_distance if squared else safe_sqrt(squared_distance)
-    return d.sum(-1) / lengths  # the padding holds zeros
+def _reduced(distance: Tensor, lengths: Tensor, reduction: str) -> Tensor:
+    """Over the last dimension, whose padding holds zeros."""
+    if reduction == "none":
+        return distance
+    if reduction == "max":
+        return distance.amax(-1) if distance.shape[-1] else distance.sum(-1)  # a batch of no clouds
+    total = distance.sum(-1)
+    return total / lengths if reduction == "mean" else total
+
+
+def f_score(
+    a: Tensor,
+    b: Tensor,
+    threshold: float,
+    *,
+    a_lengths: Tensor | None = None,
+    b_lengths: Tensor | None = None,
+) -> FScore:
+    """2 P R / (P + R): P is the share of `a` within `threshold` of `b`, R that of `b` within `threshold` of `a`.
+
+    Args:
+        a: (*B, N, 3) or (*B, N, 2) points, usually a prediction, any unit.
+        b: (*B, M, 3) or (*B, M, 2) points, usually the ground truth, same unit, dtype and leading dimensions.
+        threshold: largest distance that counts, in the unit of the clouds, not squared. Some codes compare squared
+            distances with it: pass the square root of their threshold.
+        a_lengths: (*B) int64, how many of the N points count; default all.
+        b_lengths: (*B) int64, how many of the M points count; default all.
+
+    Gradients: none; the shares are step functions.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, an empty set, NaN or infinite coordinates, or a
+            threshold below 0.
+
+    Source: Knapitsch et al., "Tanks and Temples" (2017); Tatarchenko et al., "What do single-view 3D reconstruction
+    networks learn?" (CVPR 2019), with a threshold of 1 % of the object's size.
+
+    Example:
+        >>> target = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
+        >>> score = f_score(torch.tensor([[0.0, 0.1, 0]]), target, 0.2)
+        >>> score.precision.item(), score.recall.item()
+        (1.0, 0.5)
+    """
+    a3, b3, la, lb, batch = paired_sets("f_score", a, b, a_lengths, b_lengths)
+    threshold = _checks.check_number(
+        "f_score", "threshold", threshold, "be a number of at least 0", lambda t: t >= 0
+    )
+    precision, recall = (
+        share.reshape(batch) for share in _shares_within(a3.detach(), b3.detach(), la, lb, threshold)
+    )
+    either = precision + recall
+    score = torch.where(either > 0, 2 * precision * recall / torch.where(either > 0, either, 1.0), 0.0)
+    return FScore(score, precision, recall)
 
 
 def safe_sqrt(x: Tensor) -> Tensor:
@@ -105,19 +185,22 @@ def paired_sets(
     function: str, a: Tensor, b: Tensor, a_lengths: Tensor | None, b_lengths: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, tuple[int, ...]]:
     """Checked sets with one leading dimension, lengths of all sets, and the leading dimensions for the results."""
-    _checks.check_tensor(function, "a", a, ("*", "N", 3))
+    in_space = _checks.check_points(function, "a", a, "N"), _checks.check_points(function, "b", b, "M")
     batch = tuple(a.shape[:-2])
-    _checks.check_tensor(function, "b", b, ("*", "M", 3))
-    if b.shape[:-2] != a.shape[:-2]:
-        wanted = "(" + "".join(f"{s}, " for s in batch) + "M, 3) to match 'a'"
-        raise _checks.fail(
-            function, "b", f"have shape {wanted}", str(tuple(b.shape)), "Did you forget to batch?"
+    if b.shape[:-2] != a.shape[:-2] or b.shape[-1] != a.shape[-1]:
+        wanted = "(" + "".join(f"{s}, " for s in batch) + f"M, {a.shape[-1]}) to match 'a'"
+        same_space = b.shape[-1] == a.shape[-1]
+        hint = (
+            "Did you forget to batch?"
+            if same_space
+            else "A distance is in space or in the plane, not between."
         )
+        raise _checks.fail(function, "b", f"have shape {wanted}", str(tuple(b.shape)), hint)
     _checks.check_same_dtype(function, a=a, b=b)
     la = _checks.check_lengths(function, "a_lengths", a_lengths, batch, a.shape[-2], a)
     lb = _checks.check_lengths(function, "b_lengths", b_lengths, batch, b.shape[-2], b)
     count = torch.Size(batch).numel()
-    a3, b3 = a.reshape(count, *a.shape[-2:]), b.reshape(count, *b.shape[-2:])
+    a3, b3 = (x.reshape(count, *x.shape[-2:]) for x in in_space)
     la = _bridge.full_lengths(la, count, a.shape[-2], a)
     lb = _bridge.full_lengths(lb, count, b.shape[-2], b)
     return a3, b3, la, lb, batch
@@ -159,7 +242,7 @@ def _nearest_backward(
     a: Tensor, b: Tensor, index: Tensor, grad_squared_distance: Tensor
 ) -> tuple[Tensor, Tensor]:
     grad_a, grad_b = a.new_zeros(a.shape), b.new_zeros(b.shape)
-    _add_gradients(a, b, index, grad_squared_distance, grad_a, grad_b)
+    add_nearest_gradients(a, b, index, grad_squared_distance, grad_a, grad_b)
     return grad_a, grad_b
 
 
@@ -188,10 +271,7 @@ def _nearest_both(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`_nearest` from `a` to `b` and from `b` to `a`; each set is checked and sorted once."""
     _checks.check_sets("chamfer_distance", a, b, a_lengths, b_lengths, smallest=1)
-    if _is_large(a, b):
-        x, y = sort_into_blocks(a, a_lengths), sort_into_blocks(b, b_lengths)
-        return *_search_blocks(x, y, a_lengths, b_lengths), *_search_blocks(y, x, b_lengths, a_lengths)
-    return *_search(a, b, a_lengths, b_lengths), *_search(b, a, b_lengths, a_lengths)
+    return _search_both(a, b, a_lengths, b_lengths)
 
 
 @_bridge.register(
@@ -202,9 +282,37 @@ def _nearest_both_backward(
     a: Tensor, b: Tensor, from_a: Tensor, from_b: Tensor, grad_from_a: Tensor, grad_from_b: Tensor
 ) -> tuple[Tensor, Tensor]:
     grad_a, grad_b = a.new_zeros(a.shape), b.new_zeros(b.shape)
-    _add_gradients(a, b, from_a, grad_from_a, grad_a, grad_b)
-    _add_gradients(b, a, from_b, grad_from_b, grad_b, grad_a)
+    add_nearest_gradients(a, b, from_a, grad_from_a, grad_a, grad_b)
+    add_nearest_gradients(b, a, from_b, grad_from_b, grad_b, grad_a)
     return grad_a, grad_b
+
+
+@_bridge.register(
+    "shares_within",
+    fake=lambda a, b, a_lengths, b_lengths, threshold: (a.new_empty(a.shape[0]), a.new_empty(a.shape[0])),
+)
+def _shares_within(
+    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, threshold: float
+) -> tuple[Tensor, Tensor]:
+    """Share of the points of `a` with a point of `b` at a distance of at most `threshold`, and the other way round."""
+    _checks.check_sets("f_score", a, b, a_lengths, b_lengths, smallest=1)
+    from_a, _, from_b, _ = _search_both(a, b, a_lengths, b_lengths)
+    shares = []
+    for squared_distance, lengths in ((from_a, a_lengths), (from_b, b_lengths)):
+        counts = torch.arange(squared_distance.shape[1]) < lengths[:, None]
+        within = (squared_distance.sqrt() <= threshold) & counts
+        shares.append(within.sum(-1).to(a.dtype) / lengths)
+    return shares[0], shares[1]
+
+
+def _search_both(
+    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Squared distances and indices from `a` to `b`, and from `b` to `a`."""
+    if _is_large(a, b):
+        x, y = sort_into_blocks(a, a_lengths), sort_into_blocks(b, b_lengths)
+        return *_search_blocks(x, y, a_lengths, b_lengths), *_search_blocks(y, x, b_lengths, a_lengths)
+    return *_search(a, b, a_lengths, b_lengths), *_search(b, a, b_lengths, a_lengths)
 
 
 def _is_large(a: Tensor, b: Tensor) -> bool:
@@ -232,8 +340,9 @@ def _search_blocks(a: Blocks, b: Blocks, a_lengths: Tensor, b_lengths: Tensor) -
     return squared_distance, index
 
 
-def _add_gradients(
+def add_nearest_gradients(
     a: Tensor, b: Tensor, index: Tensor, grad_squared_distance: Tensor, grad_a: Tensor, grad_b: Tensor
 ) -> None:
+    """Adds the gradients of squared distances from each point of `a` to one or several neighbours, in order."""
     if a.numel() and b.numel():
         _bridge.launch("nearest", "backward", a.dtype, a, b, index, grad_squared_distance, grad_a, grad_b)

@@ -190,7 +190,7 @@ def _compare_sets(sets: FrontSets, distance: Distance, tolerance: float) -> Tens
     a, b, a_lengths, b_lengths = sets.predicted, sets.observed, sets.predicted_lengths, sets.observed_lengths
     if distance == "chamfer":
         both = chamfer_distance(a, b, squared=False, a_lengths=a_lengths, b_lengths=b_lengths)
-        return both.a_to_b + both.b_to_a
+        return both.total
     return earth_mover_distance(a, b, tolerance=tolerance, a_lengths=a_lengths, b_lengths=b_lengths).cost
 
 
@@ -317,7 +317,7 @@ def consistency_loss(clouds: Tensor, *, reduction: Reduction = "mean") -> Tensor
     _checks.check_tensor("consistency_loss", "clouds", clouds, ("*", "V", "N", 3))
     first, second = _pairs("consistency_loss", "clouds", clouds.shape[-3])
     both = chamfer_distance(clouds[..., first, :, :], clouds[..., second, :, :], squared=False)
-    return reduce_loss("consistency_loss", (both.a_to_b + both.b_to_a).mean(-1), reduction)
+    return reduce_loss("consistency_loss", both.total.mean(-1), reduction)
 
 
 def _pairs(function: str, argument: str, count: int) -> tuple[list[int], list[int]]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 
 def pairwise_squared_distance(a: Tensor, b: Tensor) -> Tensor:
-    """(*B, N, 3), (*B, M, 3) -> (*B, N, M)."""
+    """(*B, N, D), (*B, M, D) -> (*B, N, M)."""
     return (a[..., :, None, :] - b[..., None, :, :]).square().sum(-1)
 
 
@@ -255,19 +255,78 @@ def nearest(
     return d, index
 
 
-def chamfer_distance(
-    a: Tensor, b: Tensor, *, squared: bool, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+def knn(
+    a: Tensor,
+    b: Tensor,
+    k: int,
+    *,
+    a_lengths: Tensor | None = None,
+    b_lengths: Tensor | None = None,
+    radius: float | None = None,
+    exclude_self: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """a_to_b (*B) and b_to_a (*B)."""
+    """Squared distance (*B, N, k) and index (*B, N, k)."""
+    matrix = pairwise_squared_distance(a, b)
+    if b_lengths is not None:
+        matrix = torch.where(_mask(b, b_lengths)[..., None, :], matrix, torch.inf)
+    if radius is not None:
+        matrix = torch.where(matrix <= a.new_tensor(radius).square(), matrix, torch.inf)
+    if exclude_self:
+        matrix = torch.where(torch.eye(a.shape[-2], dtype=torch.bool), torch.inf, matrix)
+    none = matrix.new_full((*matrix.shape[:-1], k), torch.inf)
+    matrix = torch.cat((matrix, none), -1)
+    index = matrix.detach().sort(dim=-1, stable=True).indices[..., :k]
+    d = torch.take_along_dim(matrix, index, dim=-1)
+    index = torch.where(torch.isinf(d), -1, index)
+    if a_lengths is not None:
+        inside = _mask(a, a_lengths)[..., None]
+        d, index = torch.where(inside, d, 0.0), torch.where(inside, index, -1)
+    return d, index
+
+
+def chamfer_distance(
+    a: Tensor,
+    b: Tensor,
+    *,
+    squared: bool,
+    reduction: str = "mean",
+    a_lengths: Tensor | None = None,
+    b_lengths: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """a_to_b (*B) and b_to_a (*B); (*B, N) and (*B, M) with reduction "none"."""
     directions = []
     for first, second, first_lengths, second_lengths in (
         (a, b, a_lengths, b_lengths),
         (b, a, b_lengths, a_lengths),
     ):
         d, _ = nearest(first, second, a_lengths=first_lengths, b_lengths=second_lengths)
+        d = d if squared else _sqrt(d)
         count = first.shape[-2] if first_lengths is None else first_lengths
-        directions.append((d if squared else _sqrt(d)).sum(-1) / count)
+        if reduction == "mean":
+            d = d.sum(-1) / count
+        elif reduction != "none":
+            d = d.sum(-1) if reduction == "sum" else d.amax(-1)
+        directions.append(d)
     return directions[0], directions[1]
+
+
+def f_score(
+    a: Tensor,
+    b: Tensor,
+    threshold: float,
+    *,
+    a_lengths: Tensor | None = None,
+    b_lengths: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """F-score, precision and recall (*B)."""
+    lengths = {"a_lengths": a_lengths, "b_lengths": b_lengths}
+    distances = chamfer_distance(a, b, squared=False, reduction="none", **lengths)
+    shares = []
+    for points, d, count in zip((a, b), distances, (a_lengths, b_lengths), strict=True):
+        count = torch.full(points.shape[:-2], points.shape[-2]) if count is None else count
+        shares.append(((d <= threshold) & _mask(points, count)).sum(-1).to(a.dtype) / count)
+    precision, recall = shares
+    return (2 * precision * recall / (precision + recall)).nan_to_num(0.0), precision, recall
 
 
 def earth_mover_distance(
@@ -360,19 +419,23 @@ def soft_match(squared_distance: Tensor) -> Tensor:
     return match
 
 
-def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Tensor | None = None) -> Tensor:
-    """Indices (*B, k)."""
-    distance = points.new_full(points.shape[:-1], torch.inf)
-    if lengths is not None:
-        distance = torch.where(_mask(points, lengths), distance, -1.0)
-    current = torch.full(points.shape[:-2], start)
-    chosen = []
-    for _ in range(k):
-        chosen.append(current)
+def farthest_point_sample(
+    points: Tensor, k: int | Tensor, *, start: int | Tensor = 0, lengths: Tensor | None = None
+) -> Tensor:
+    """Indices (*B, k); -1 after the k points of a cloud, or after all that it has."""
+    batch = points.shape[:-2]
+    sizes = torch.full(batch, points.shape[-2]) if lengths is None else lengths
+    counts = torch.as_tensor(k).expand(batch)
+    distance = torch.where(_mask(points, sizes), torch.inf, -1.0).to(points.dtype)
+    current = torch.as_tensor(start).expand(batch)
+    chosen = torch.full((*batch, int(torch.as_tensor(k).max())), -1)
+    for step in range(chosen.shape[-1] if points.shape[-2] else 0):
+        chosen[..., step] = torch.where(step < torch.minimum(counts, sizes), current, -1)
         here = torch.take_along_dim(points, current[..., None, None], dim=-2)
         distance = torch.minimum(distance, (points - here).square().sum(-1))
+        distance = distance.scatter(-1, current[..., None], -1.0)  # none is chosen twice
         current = (distance == distance.max(-1, keepdim=True).values).to(torch.uint8).argmax(-1)
-    return torch.stack(chosen, dim=-1) if chosen else torch.empty(*points.shape[:-2], 0, dtype=torch.long)
+    return chosen
 
 
 def front_constraint(

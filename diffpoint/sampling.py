@@ -13,17 +13,28 @@ _LANES = 16  # as in kernels/sampling.py
 _LARGE = 4096  # points from which the search with boxes is faster than updating every distance
 
 
-def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Tensor | None = None) -> Tensor:
-    """Indices of k points; each is the farthest from those chosen before it.
+def farthest_point_sample(
+    points: Tensor,
+    k: int | Tensor,
+    *,
+    start: int | Tensor | str = 0,
+    lengths: Tensor | None = None,
+    allow_fewer: bool = False,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Indices of k different points; each is the farthest from those chosen before it.
 
     Args:
-        points: (*B, N, 3), any unit.
-        k: how many points to choose, at most the size of the smallest cloud.
-        start: index of the first chosen point.
+        points: (*B, N, 3) or (*B, N, 2), any unit.
+        k: how many points to choose, at most the size of a cloud; an integer, or (*B) int64 for as many of each cloud.
+        start: index of the first chosen point; an integer, (*B) int64, or "random".
         lengths: (*B) int64, how many of the N points count; default all.
+        allow_fewer: choose all points of a cloud that has fewer than k, instead of raising an error.
+        generator: of the random numbers of `start="random"`; default torch's own.
 
     Returns:
-        (*B, k) int64. Equal distances go to the lowest index: the same input gives the same indices.
+        (*B, k) int64, with the largest k if there are several; -1 after the chosen points of a cloud. Equal distances
+        go to the lowest index: the same input gives the same indices.
 
     Gradients: none; gather the points with the result to pass gradients to them.
 
@@ -31,45 +42,87 @@ def farthest_point_sample(points: Tensor, k: int, *, start: int = 0, lengths: Te
         ValueError, TypeError: wrong shapes, dtypes or devices, k or start out of range, NaN or infinite coordinates.
 
     Example:
-        >>> farthest_point_sample(torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2).tolist()
+        >>> line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
+        >>> farthest_point_sample(line, 2).tolist()
         [0, 2]
+        >>> farthest_point_sample(line[None].expand(2, -1, -1), torch.tensor([1, 3])).tolist()
+        [[0, -1, -1], [0, 2, 1]]
     """
-    _checks.check_tensor("farthest_point_sample", "points", points, ("*", "N", 3))
+    name = "farthest_point_sample"
+    points = _checks.check_points(name, "points", points, "N")
     batch = tuple(points.shape[:-2])
-    lengths = _checks.check_lengths(
-        "farthest_point_sample", "lengths", lengths, batch, points.shape[-2], points
-    )
-    k = _checks.check_integer("farthest_point_sample", "k", k, "be an integer of at least 0", 0)
-    start = _checks.check_integer("farthest_point_sample", "start", start, "be an integer of at least 0", 0)
+    lengths = _checks.check_lengths(name, "lengths", lengths, batch, points.shape[-2], points)
+    if generator is not None and not isinstance(start, str):
+        raise _checks.fail(name, "generator", "be None without start='random'", repr(generator))
     flat = points.reshape(torch.Size(batch).numel(), *points.shape[-2:])
     lengths = _bridge.full_lengths(lengths, flat.shape[0], flat.shape[1], flat)
-    return _farthest(flat, lengths, k, start).reshape(*batch, k)
+    counts, width = _integers("k", k, flat, batch), -1 if isinstance(k, Tensor) else int(k)
+    if isinstance(start, str):
+        if start != "random":
+            raise _checks.fail(name, "start", "be an integer, a tensor of integers, or 'random'", repr(start))
+        starts = _random_starts(lengths, generator)
+    else:
+        starts = _integers("start", start, flat, batch)
+    chosen = _farthest(flat, lengths, counts, starts, width, allow_fewer)
+    return chosen.reshape(*batch, chosen.shape[-1])
 
 
-@_bridge.register(
-    "farthest_point_sample",
-    fake=lambda points, lengths, k, start: points.new_empty((points.shape[0], k), dtype=torch.int64),
-)
-def _farthest(points: Tensor, lengths: Tensor, k: int, start: int) -> Tensor:
+def _integers(name: str, value: int | Tensor, points: Tensor, batch: tuple[int, ...]) -> Tensor:
+    """(B,) int64, one for each cloud."""
+    if isinstance(value, Tensor):
+        checked = _checks.check_lengths("farthest_point_sample", name, value, batch, points.shape[1], points)
+        assert checked is not None
+        return checked.reshape(points.shape[0])
+    number = _checks.check_integer("farthest_point_sample", name, value, "be an integer of at least 0", 0)
+    return torch.full((points.shape[0],), number, dtype=torch.int64, device=points.device)
+
+
+def _random_starts(lengths: Tensor, generator: torch.Generator | None) -> Tensor:
+    device = lengths.device if generator is None else generator.device
+    share = torch.rand(lengths.shape, dtype=torch.float64, generator=generator, device=device)
+    return (share.to(lengths.device) * lengths).to(torch.int64)
+
+
+def _farthest_fake(
+    points: Tensor, lengths: Tensor, counts: Tensor, starts: Tensor, width: int, allow_fewer: bool
+) -> Tensor:
+    if width < 0:
+        width = torch.library.get_ctx().new_dynamic_size()
+    return points.new_empty((points.shape[0], width), dtype=torch.int64)
+
+
+@_bridge.register("farthest_point_sample", fake=_farthest_fake)
+def _farthest(
+    points: Tensor, lengths: Tensor, counts: Tensor, starts: Tensor, width: int, allow_fewer: bool
+) -> Tensor:
+    """(B, width), or (B, the largest of `counts`) if `width` is below 0."""
     batch, size, _ = points.shape
-    _checks.check_picks(lengths, size, k, start)
+    _checks.check_picks(lengths, size, counts, starts, allow_fewer=allow_fewer)
     _checks.check_finite("farthest_point_sample", "points", points, lengths)
-    chosen = torch.empty((batch, k), dtype=torch.int64)
-    if chosen.numel() == 0:
+    if width < 0:
+        width = int(counts.max()) if batch else 0
+    chosen = torch.full((batch, width), -1, dtype=torch.int64)
+    if chosen.numel() == 0 or size == 0:
         return chosen
+    counts = torch.minimum(counts, lengths)
     if size < _LARGE:
         axes = lanes(points)
-        distance = _unset_distance(points, lengths, axes[0][0].numel()).view(axes[0].shape)
-        _bridge.launch("sampling", "farthest", points.dtype, points, *axes, distance, chosen, start)
+        distance = _unset_distance(points, lengths, axes[0][0].numel())
+        distances = distance.view(axes[0].shape), distance
+        _bridge.launch(
+            "sampling", "farthest", points.dtype, points, *axes, *distances, counts, starts, chosen
+        )
         return chosen
     blocks = sort_into_blocks(points, lengths)
-    distance = _unset_distance(points, lengths, blocks.points.shape[1]).view(batch, -1, _LANES)
+    distance = _unset_distance(points, lengths, blocks.points.shape[1])
     box_farthest = points.new_empty((batch, blocks.boxes.shape[2]))
     box_point = torch.zeros(box_farthest.shape, dtype=torch.int32)
-    scratch = distance, box_farthest, box_farthest.view(batch, -1, _LANES), box_point
-    axes = lanes(blocks.points)
-    sorted_points = blocks.points, *axes, blocks.order, blocks.box_lanes
-    _bridge.launch("sampling", "farthest_blocks", points.dtype, *sorted_points, *scratch, chosen, start)
+    scratch = distance.view(batch, -1, _LANES), distance, box_farthest, box_farthest.view(batch, -1, _LANES)
+    sorted_points = blocks.points, *lanes(blocks.points), blocks.order, blocks.box_lanes
+    chosen_by = counts, starts, chosen
+    _bridge.launch(
+        "sampling", "farthest_blocks", points.dtype, *sorted_points, *scratch, box_point, *chosen_by
+    )
     return chosen
 
 

@@ -19,8 +19,8 @@ def approxmatch(
     times the number of points; use `earth_mover_distance` unless you need the paper's numbers.
 
     Args:
-        a: (*B, N, 3) points, any unit (the length scales are absolute: meant for shapes about 1 across).
-        b: (*B, M, 3) points, same unit, dtype and leading dimensions.
+        a: (*B, N, 3) or (*B, N, 2) points, any unit (the length scales are absolute: meant for shapes about 1 across).
+        b: (*B, M, 3) or (*B, M, 2) points, same unit, dtype and leading dimensions.
         a_lengths: (*B) int64, how many of the N points count; default all.
         b_lengths: (*B) int64, how many of the M points count; default all.
 

@@ -44,8 +44,8 @@ def earth_mover_distance(
     increment stops when the duality gap is at most `tolerance` (the cost is usually much closer to the optimum).
 
     Args:
-        a: (*B, N, 3) points, any unit.
-        b: (*B, M, 3) points, same unit, dtype and leading dimensions.
+        a: (*B, N, 3) or (*B, N, 2) points, any unit.
+        b: (*B, M, 3) or (*B, M, 2) points, same unit, dtype and leading dimensions.
         tolerance: how far above the optimum the cost may be, relative to it.
         start: the result for the same sets before a small motion, as in the previous step of a descent: sizes and order
             of the points must be the same. Its prices make the auction two to five times faster. Tolerance and bound

@@ -81,7 +81,7 @@ def cloud_loss(scene: Scene, camera: dp.PinholeCamera) -> Tensor:
     """Chamfer distance between the clouds of both depth maps; that of the second moves with its camera."""
     points, lengths = dp.unproject(scene.second_depth, camera)
     both = dp.chamfer_distance(scene.cloud, points[:, 0], squared=False, b_lengths=lengths[:, 0])
-    return (both.a_to_b + both.b_to_a).mean()
+    return both.total.mean()
 
 
 LOSSES = {"matched pixels": matched_pixel_loss, "warped depth": warped_depth_loss, "clouds": cloud_loss}

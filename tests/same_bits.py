@@ -104,6 +104,12 @@ OPS: dict[str, Callable[[], list[Tensor]]] = {
         for sizes in ((5, 300, 400), (2, 3000, 3100))
         for t in both(lambda a, b: dp.nearest(a, b)[:1], *sizes)
     ],
+    "knn": lambda: [
+        t
+        for sizes in ((5, 300, 400), (2, 3000, 3100))
+        for t in both(lambda a, b: dp.knn(a, b, 8)[:1], *sizes)
+    ],
+    "f_score": lambda: [*dp.f_score(clouds(5, 300, 8), clouds(5, 400, 9), 0.05)],
     "chamfer_distance": lambda: [
         t
         for sizes in ((1, 900, 700), (5, 300, 400), (2, 3000, 3100))

@@ -25,8 +25,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 DTYPES = (torch.float32, torch.float64)
 LAUNCHES: dict[str, dict] = {}
 OPERATORS = operator_arguments()
-ELSEWHERE = {"earth_mover_distance"}
-"""Tested in another file."""
+ELSEWHERE = {"earth_mover_distance", "knn"}
+"""Tested in another file; copied to the CPU and back."""
 
 
 @pytest.fixture(autouse=True)
@@ -144,6 +144,12 @@ def test_farthest_points(dtype, registers, monkeypatch):
     points[1, 170:] = torch.nan
     lengths = torch.tensor([300, 170])
     assert_same(lambda *x: [dp.farthest_point_sample(x[0], 20, start=5, lengths=x[1])], points, lengths)
+    points[0, 20:] = points[0, 0].clone()  # no point is chosen twice
+
+    def outputs(points, lengths, k, start):
+        return [dp.farthest_point_sample(points, k, start=start, lengths=lengths, allow_fewer=True)]
+
+    assert_same(outputs, points, lengths, torch.tensor([40, 180]), torch.tensor([3, 169]))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

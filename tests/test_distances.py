@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import directed_hausdorff
 
 import diffpoint as dp
-from diffpoint import distances, reference, sampling
+from diffpoint import distances, neighbours, reference, sampling
 from diffpoint.testing import assert_close
 
 DTYPES = (torch.float32, torch.float64)
@@ -66,6 +67,105 @@ def test_distances_beyond_the_number_format_are_infinite(monkeypatch, large):
     assert all(torch.isfinite(g).all() for g in gradients)
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (33, 70), (500, 1300), (40, 2100)])
+@pytest.mark.parametrize("kind", ["random", "lattice", "one place", "extreme", "beyond the format"])
+@pytest.mark.parametrize("by_sorting", [False, True])
+def test_neighbours_are_those_of_the_reference_to_the_bit(monkeypatch, dtype, n, m, kind, by_sorting):
+    """Also in ties, where the lower index comes first; with fewer than k in reach; by either way of searching."""
+    if by_sorting:
+        monkeypatch.setattr(neighbours, "_LARGE_K", 0)
+        monkeypatch.setattr(neighbours, "_SORTED_AT_ONCE", 30 * m)
+    a, b = random(3, n, 3, seed=1, dtype=dtype), random(3, m, 3, seed=2, dtype=dtype)
+    if kind == "lattice":
+        a, b = (a * 4).round(), (b * 4).round()
+    elif kind == "one place":
+        a, b = torch.full_like(a, 0.3), torch.full_like(b, 0.3)
+    elif kind == "extreme":
+        a, b = a * 1e6, b * 1e-6
+    elif kind == "beyond the format":  # some of the squares are infinite
+        a, b = ((x.double() * (1e20 if dtype == torch.float32 else 1e155)).to(dtype) for x in (a, b))
+    lengths = torch.tensor([n, n // 2, n])
+    clouds = {"a_lengths": lengths, "b_lengths": torch.tensor([m, m, m // 3])}
+    itself = {"a_lengths": lengths, "b_lengths": lengths, "exclude_self": True}
+    for k in (1, 5, 20):
+        for radius in (None, 0.3, 2.0):
+            for second, options in ((b, clouds), (a, itself)):
+                ours = dp.knn(a, second, k, radius=radius, **options)
+                theirs = reference.knn(a, second, k, radius=radius, **options)
+                assert torch.equal(ours.index, theirs[1])
+                assert torch.equal(ours.squared_distance, theirs[0])
+
+
+def test_more_neighbours_than_the_kernel_keeps():
+    a, b = random(1, 40, 3, seed=1), random(1, 400, 3, seed=2)
+    for k in (neighbours._LARGE_K, neighbours._LARGE_K + 1, 500):
+        ours, theirs = dp.knn(a, b, k), reference.knn(a, b, k)
+        assert torch.equal(ours.index, theirs[1])
+        assert torch.equal(ours.squared_distance, theirs[0])
+
+
+def test_the_nearest_neighbour_is_nearest():
+    a, b = random(2, 300, 3, seed=1), random(2, 500, 3, seed=2)
+    one, nearest = dp.knn(a, b, 1), dp.nearest(a, b)
+    assert torch.equal(one.index[..., 0], nearest.index)
+    assert torch.equal(one.squared_distance[..., 0], nearest.squared_distance)
+
+
+def test_a_radius_counts_the_points_at_it():
+    line = torch.arange(5.0)[:, None] * torch.tensor([1.0, 0, 0])
+    found = dp.knn(line, line, 4, radius=1.0, exclude_self=True)
+    assert found.index.tolist() == [
+        [1, -1, -1, -1],
+        [0, 2, -1, -1],
+        [1, 3, -1, -1],
+        [2, 4, -1, -1],
+        [3, -1, -1, -1],
+    ]
+    assert found.squared_distance[0].tolist() == [1.0, torch.inf, torch.inf, torch.inf]
+    assert dp.knn(line, line, 1, radius=0.0).index[:, 0].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_only_a_cloud_itself_has_a_self_to_exclude():
+    a = random(2, 9, 3)
+    copy, padded = a.clone(), a.clone()
+    padded[1, 8] = 9.0
+    lengths = {"a_lengths": torch.tensor([9, 8]), "b_lengths": torch.tensor([9, 8])}
+    for b, options in ((copy, {}), (padded, lengths)):
+        ours, same = (dp.knn(a, x, 2, exclude_self=True, **options) for x in (b, a))
+        assert torch.equal(ours.index, same.index)
+    for b, options in ((padded, {}), (a.flip(1), {}), (a, {"a_lengths": torch.tensor([9, 8])})):
+        with pytest.raises(ValueError, match="knn: 'b' must hold the points of 'a' with exclude_self=True"):
+            dp.knn(a, b, 2, exclude_self=True, **options)
+    with pytest.raises(
+        ValueError, match=r"knn: 'b' must have shape \(2, 9, 3\).*pass the points of 'a' again"
+    ):
+        dp.knn(a, a[:, :5], 2, exclude_self=True)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_points_in_a_plane_have_the_distances_of_points_in_space(dtype):
+    a, b = leaf(2, 30, 2, seed=1, dtype=dtype), leaf(2, 40, 2, seed=2, dtype=dtype)
+    a3, b3 = (torch.nn.functional.pad(x, (0, 1)) for x in (a, b))
+    for op in (
+        dp.nearest,
+        lambda x, y: dp.knn(x, y, 3),
+        lambda x, y: dp.chamfer_distance(x, y, squared=False),
+        lambda x, y: dp.earth_mover_distance(x, y)[:2],
+        lambda x, y: (dp.approxmatch(x, y),),
+    ):
+        plane, space = op(a, b), op(a3, b3)
+        assert all(torch.equal(x, y) for x, y in zip(plane, space, strict=True))
+        gradients = [torch.autograd.grad(result[0].sum(), (a, b)) for result in (plane, space)]
+        assert gradients[0][0].shape == (2, 30, 2)
+        assert all(torch.equal(x, y) for x, y in zip(*gradients, strict=True))
+    assert torch.equal(dp.farthest_point_sample(a, 9), dp.farthest_point_sample(a3, 9))
+    with pytest.raises(ValueError, match=r"'b' must have shape \(2, M, 2\) to match 'a'; got \(2, 40, 3\)"):
+        dp.nearest(a, b3)
+    with pytest.raises(ValueError, match="The last size must be 3, or 2 for points in a plane, not 4"):
+        dp.nearest(torch.zeros(2, 5, 4), b3)
+
+
 def test_chamfer_of_large_clouds_is_that_of_small_ones(monkeypatch):
     a, b = leaf(2, 700, 3, seed=1), leaf(2, 1100, 3, seed=2)
     lengths = {"a_lengths": torch.tensor([700, 40]), "b_lengths": torch.tensor([1100, 1000])}
@@ -85,6 +185,44 @@ def test_chamfer_of_a_shifted_lattice_is_the_shift():
     assert_close(torch.stack(chamfer), torch.tensor([0.1, 0.1]), scale=10)
     squared = dp.chamfer_distance(lattice, lattice + shift, squared=True)
     assert_close(torch.stack(squared), torch.tensor([0.01, 0.01]), scale=10)
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_reductions_of_the_distances_of_the_points(squared):
+    a, b = random(2, 40, 3, seed=1), random(2, 30, 3, seed=2)
+    lengths = {"a_lengths": torch.tensor([40, 7]), "b_lengths": torch.tensor([30, 11])}
+    each = dp.chamfer_distance(a, b, squared=squared, reduction="none", **lengths)
+    assert each.a_to_b.shape == (2, 40)
+    assert each.b_to_a.shape == (2, 30)
+    assert (each.a_to_b[1, 7:] == 0).all()
+    for reduction in ("mean", "sum", "max"):
+        reduced = dp.chamfer_distance(a, b, squared=squared, reduction=reduction, **lengths)
+        for d, total, count in zip(each, reduced, lengths.values(), strict=True):
+            expected = {"mean": d.sum(-1) / count, "sum": d.sum(-1), "max": d.amax(-1)}
+            assert torch.equal(total, expected[reduction])
+        assert torch.equal(reduced.total, reduced.a_to_b + reduced.b_to_a)
+    default = dp.chamfer_distance(a, b, squared=squared, **lengths)
+    assert torch.equal(default.a_to_b, each.a_to_b.sum(-1) / lengths["a_lengths"])
+
+
+def test_the_largest_directed_distance_is_scipys_hausdorff_distance():
+    a, b = random(70, 3, seed=1), random(50, 3, seed=2)
+    directed = dp.chamfer_distance(a, b, squared=False, reduction="max")
+    scipys = [directed_hausdorff(x, y)[0] for x, y in ((a, b), (b, a))]
+    assert torch.stack(directed).tolist() == pytest.approx(scipys)
+
+
+def test_the_f_score_counts_points_within_the_threshold():
+    target = torch.arange(10.0)[:, None] * torch.tensor([1.0, 0, 0])
+    predicted = torch.cat((target[:4] + torch.tensor([0.0, 0.25, 0]), target[:2] + 50))
+    score = dp.f_score(predicted, target, 0.25)
+    assert score.precision.item() == pytest.approx(4 / 6)
+    assert score.recall.item() == pytest.approx(4 / 10)
+    assert score.f_score.item() == pytest.approx(2 * (4 / 6) * 0.4 / (4 / 6 + 0.4))
+    assert [s.item() for s in dp.f_score(predicted, target, 0.24)] == [0, 0, 0]
+    assert [s.item() for s in dp.f_score(target, target, 0.0)] == [1, 1, 1]
+    padded = dp.f_score(predicted, target, 0.25, a_lengths=torch.tensor(4), b_lengths=torch.tensor(8))
+    assert (padded.precision.item(), padded.recall.item()) == (1.0, 0.5)
 
 
 def test_chamfer_of_a_set_with_itself_is_zero_with_zero_gradient():
@@ -177,6 +315,80 @@ def test_farthest_points_of_large_and_small_clouds_come_in_the_same_order(monkey
             patch.setattr(sampling, "_LARGE", 0)
             with_boxes = dp.farthest_point_sample(points, k, start=start, lengths=lengths)
         assert torch.equal(every_distance, with_boxes)
+
+
+@pytest.mark.parametrize("large", [False, True])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_no_point_is_chosen_twice(monkeypatch, large, dtype):
+    """Not even where all that remain lie on chosen ones; these come in order."""
+    if large:
+        monkeypatch.setattr(sampling, "_LARGE", 0)
+    duplicates = random(2, 3, 3, dtype=dtype).repeat(1, 14, 1)
+    for points in (duplicates, torch.full((2, 40, 3), 0.3, dtype=dtype), random(2, 40, 3, dtype=dtype)):
+        size = points.shape[1]
+        chosen = dp.farthest_point_sample(points, size, start=5)
+        assert torch.equal(chosen, reference.farthest_point_sample(points, size, start=5))
+        assert torch.equal(chosen.sort(-1).values, torch.arange(size).expand(2, -1))
+    one_place = dp.farthest_point_sample(torch.zeros(8, 3, dtype=dtype), 8, start=2)
+    assert one_place.tolist() == [2, 0, 1, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_each_cloud_has_its_own_number_and_start(monkeypatch, large):
+    if large:
+        monkeypatch.setattr(sampling, "_LARGE", 0)
+    points, lengths = random(2, 2, 50, 3), torch.tensor([[50, 20], [7, 0]])
+    k, start = torch.tensor([[9, 20], [3, 0]]), torch.tensor([[49, 2], [6, 0]])
+    chosen = dp.farthest_point_sample(points, k, start=start, lengths=lengths)
+    assert chosen.shape == (2, 2, 20)
+    assert torch.equal(chosen, reference.farthest_point_sample(points, k, start=start, lengths=lengths))
+    for i, j in ((0, 0), (0, 1), (1, 0)):
+        alone = dp.farthest_point_sample(points[i, j, : lengths[i, j]], int(k[i, j]), start=int(start[i, j]))
+        assert torch.equal(chosen[i, j, : k[i, j]], alone)
+        assert (chosen[i, j, k[i, j] :] == -1).all()
+    assert (chosen[1, 1] == -1).all()
+    with pytest.raises(ValueError, match=r"'k' must be at most 6; got 9 for cloud 1, .*allow_fewer"):
+        dp.farthest_point_sample(points[:, 0], 9, lengths=torch.tensor([50, 6]))
+    with pytest.raises(ValueError, match="'k' must be at least 0; got -2 for cloud 1"):
+        dp.farthest_point_sample(points[0], torch.tensor([3, -2]))
+    with pytest.raises(ValueError, match="'start' must be at most 19; got 20 for cloud 1"):
+        dp.farthest_point_sample(points[0], 3, start=torch.tensor([3, 20]), lengths=lengths[0])
+    with pytest.raises(ValueError, match=r"'k' must have shape \(2,\); got \(3,\)"):
+        dp.farthest_point_sample(points[0], torch.tensor([3, 2, 1]))
+
+
+def test_clouds_with_too_few_points_are_chosen_whole_on_request():
+    points, lengths = random(3, 30, 3), torch.tensor([30, 4, 0])
+    chosen = dp.farthest_point_sample(points, 10, lengths=lengths, allow_fewer=True)
+    assert ((chosen >= 0).sum(-1) == torch.tensor([10, 4, 0])).all()
+    assert chosen[1, :4].sort().values.tolist() == [0, 1, 2, 3]
+    assert dp.farthest_point_sample(torch.zeros(2, 0, 3), 3, allow_fewer=True).tolist() == [[-1] * 3] * 2
+    with pytest.raises(ValueError, match="allow_fewer"):
+        dp.farthest_point_sample(torch.zeros(2, 0, 3), 3)
+
+
+def test_random_starts_are_those_of_the_generator():
+    points, lengths = random(200, 12, 3), torch.tensor([12, 3]).repeat(100)
+
+    def starts(seed: int) -> torch.Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        return dp.farthest_point_sample(points, 2, start="random", lengths=lengths, generator=generator)
+
+    first = starts(0)
+    assert torch.equal(first, starts(0))
+    assert not torch.equal(first, starts(1))
+    assert first[::2, 0].unique().tolist() == [*range(12)]
+    assert first[1::2, 0].unique().tolist() == [0, 1, 2]
+    expected = reference.farthest_point_sample(points, 2, start=first[:, 0], lengths=lengths)
+    assert torch.equal(first, expected)
+    torch.manual_seed(0)
+    again = dp.farthest_point_sample(points, 2, start="random", lengths=lengths)
+    torch.manual_seed(0)
+    assert torch.equal(again, dp.farthest_point_sample(points, 2, start="random", lengths=lengths))
+    with pytest.raises(ValueError, match=r"'start' must be an integer.* or 'random'; got 'farthest'"):
+        dp.farthest_point_sample(points, 2, start="farthest")
+    with pytest.raises(ValueError, match="'generator' must be None without start='random'"):
+        dp.farthest_point_sample(points, 2, generator=torch.Generator())
 
 
 def test_farthest_points_cover_better_than_random_ones():

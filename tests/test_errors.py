@@ -27,6 +27,10 @@ CLOUDS: Ops = {
 SETS: Ops = {
     "nearest a": lambda x: dp.nearest(x, torch.rand(2, 5, 3)),
     "nearest b": lambda x: dp.nearest(torch.rand(2, 5, 3), x),
+    "knn a": lambda x: dp.knn(x, torch.rand(2, 5, 3), 2),
+    "knn b": lambda x: dp.knn(torch.rand(2, 5, 3), x, 2),
+    "f_score a": lambda x: dp.f_score(x, torch.rand(2, 5, 3), 0.1),
+    "f_score b": lambda x: dp.f_score(torch.rand(2, 5, 3), x, 0.1),
     "chamfer_distance a": lambda x: dp.chamfer_distance(x, torch.rand(2, 5, 3), squared=True),
     "chamfer_distance b": lambda x: dp.chamfer_distance(torch.rand(2, 5, 3), x, squared=True),
     "earth_mover_distance a": lambda x: dp.earth_mover_distance(x, torch.rand(2, 5, 3)),
@@ -137,6 +141,7 @@ def test_empty_sets_have_no_distance():
     full, empty = torch.rand(2, 5, 3), torch.rand(2, 0, 3)
     for function in (
         lambda a, b, **k: dp.chamfer_distance(a, b, squared=False, **k),
+        lambda a, b, **k: dp.f_score(a, b, 0.1, **k),
         dp.earth_mover_distance,
     ):
         for a, b in ((full, empty), (empty, full)):
@@ -190,6 +195,14 @@ def test_options_out_of_range():
     for call, message in (
         (lambda: dp.splat_depth(points, CAMERA, radius=-1.0), "'radius' must be a finite number"),
         (lambda: dp.splat_depth(points, CAMERA, radius=float("nan")), "'radius' must be a finite number"),
+        (lambda: dp.f_score(points, points, -0.1), "'threshold' must be a number of at least 0"),
+        (
+            lambda: dp.chamfer_distance(points, points, squared=True, reduction="max over"),
+            "'reduction' must be one of 'mean', 'sum', 'max', 'none'",
+        ),
+        (lambda: dp.knn(points, points, 0), "'k' must be a positive integer"),
+        (lambda: dp.knn(points, points, 1, radius=-1.0), "'radius' must be a number of at least 0"),
+        (lambda: dp.knn(points, points, 1, radius=float("nan")), "'radius' must be a number of at least 0"),
         (lambda: dp.farthest_point_sample(points, 6), "'k' must be at most 5"),
         (lambda: dp.farthest_point_sample(points, -1), "'k' must be an integer of at least 0"),
         (lambda: dp.farthest_point_sample(points, 2, start=5), "'start' must be at most 4"),
@@ -209,12 +222,20 @@ def test_options_out_of_range():
             call()
 
 
-@pytest.mark.parametrize("op", CLOUDS | SETS)
+@pytest.mark.parametrize("op", CLOUDS)
 @pytest.mark.parametrize("shape", [(2, 7, 2), (7, 2), (2, 7, 4), (2,)])
 def test_a_wrong_last_size_is_named(op, shape):
     """Also where a dimension is missing, as in a cloud (7, 2) of points in the plane."""
     with pytest.raises(ValueError, match=rf"The last size must be 3, not {shape[-1]}\.$"):
-        (CLOUDS | SETS)[op](torch.rand(shape))
+        CLOUDS[op](torch.rand(shape))
+
+
+@pytest.mark.parametrize("op", SETS)
+@pytest.mark.parametrize("shape", [(2, 7, 4), (7, 1)])
+def test_sets_are_in_space_or_in_a_plane(op, shape):
+    message = rf"The last size must be 3, or 2 for points in a plane, not {shape[-1]}\.$"
+    with pytest.raises(ValueError, match=message):
+        SETS[op](torch.rand(shape))
 
 
 NUMBERS: dict[str, tuple[str, Callable]] = {
@@ -306,7 +327,13 @@ def test_an_empty_batch_has_an_empty_result(count):
     depth = torch.zeros(0, 2, 8, 8)
     results = [
         *dp.nearest(points, points),
-        *dp.chamfer_distance(points, points, squared=True),
+        *dp.knn(points, points, 2, exclude_self=True),
+        *(
+            x
+            for how in ("mean", "sum", "max", "none")
+            for x in dp.chamfer_distance(points, points, squared=True, reduction=how)
+        ),
+        *dp.f_score(points, points, 0.1),
         *dp.earth_mover_distance(points, points),
         dp.approxmatch(points, points),
         dp.farthest_point_sample(points, 3),

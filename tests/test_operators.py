@@ -25,6 +25,8 @@ def operator_arguments() -> dict[str, tuple]:
     return {
         "nearest": (a, b, *lengths),
         "nearest_both": (a, b, *lengths),
+        "knn": (a, b, *lengths, 3, 0.8, False),
+        "shares_within": (a.detach(), b.detach(), *lengths, 0.4),
         "splat": (a, lengths[0], projection, H, W, 0.0),
         "soft_splat": (*soft, lengths[0], H, W, 2.0, 0.05),
         "project": (a, projection),
@@ -32,7 +34,14 @@ def operator_arguments() -> dict[str, tuple]:
         "reproject": (depth, camera.back_projection.clone().requires_grad_(), projection, H, W),
         "earth_mover_distance": (a, b, *lengths, torch.zeros(B, N), -torch.ones(B), torch.ones(B), 0.02),
         "approxmatch": (a, b, *lengths, True),
-        "farthest_point_sample": (a.detach(), lengths[0], 3, 0),
+        "farthest_point_sample": (
+            a.detach(),
+            lengths[0],
+            torch.tensor([3, 2]),
+            torch.tensor([0, 1]),
+            -1,
+            False,
+        ),
         "sample_view": (a, dp.splat_depth(a, camera).visible),
         "visible": (a.detach(), lengths[0], projection.detach(), H, W, "horizon", 3.0, 0.4),
     }
@@ -53,6 +62,7 @@ def test_every_operator_is_checked():
     "function",
     [
         lambda a, b: dp.nearest(a, b).squared_distance.sum(),
+        lambda a, b: dp.knn(a, b, 2).squared_distance.sum(),
         lambda a, b: sum(dp.chamfer_distance(a, b, squared=True)).sum(),
         lambda a, b: dp.earth_mover_distance(a, b).cost.sum(),
     ],
@@ -146,6 +156,8 @@ def every_op(points: torch.Tensor, target: torch.Tensor, camera: dp.PinholeCamer
     outputs += dp.soft_splat(points, camera, lengths=torch.full((2,), 50, device=target.device))
     outputs += [*dp.nearest(points, target), *dp.chamfer_distance(points, target, squared=False)]
     outputs += dp.earth_mover_distance(points, target)
+    outputs += dp.f_score(points, target, 0.1, b_lengths=torch.full((2,), 40, device=target.device))
+    outputs += dp.knn(points, target, 4, a_lengths=torch.full((2,), 50, device=target.device))
     # The lazy device lacks a view that torch takes in the backward pass of masked_scatter: no gradient of this one.
     constraint = dp.front_constraint(points, camera, splat.depth.detach() + 0.1).detach()
     return [*outputs, dp.approxmatch(points, target), constraint]
@@ -181,6 +193,7 @@ def test_devices_are_not_mixed(elsewhere):
         (lambda: dp.project(points, CAMERA.to(elsewhere)), "camera"),
         (lambda: dp.reproject(depth, CAMERA, CAMERA.to(elsewhere)), "target"),
         (lambda: dp.nearest(points, points.to(elsewhere)), "b"),
+        (lambda: dp.knn(points, points, 1, a_lengths=lengths.to(elsewhere)), "a_lengths"),
         (lambda: dp.nearest(points, points, b_lengths=lengths.to(elsewhere)), "b_lengths"),
         (lambda: dp.farthest_point_sample(points, 2, lengths=lengths.to(elsewhere)), "lengths"),
         (lambda: dp.projection_loss(points, CAMERA, depth.to(elsewhere)), "depth"),

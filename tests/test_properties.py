@@ -64,13 +64,21 @@ def arguments(name: str, largest: int, family: str) -> tuple[st.SearchStrategy, 
     small = min(largest, 40)  # the reference takes time cubic in the number of points
     return {
         "nearest": (strategies.pairs(largest, family),),
+        "knn": (
+            strategies.pairs(largest, family),
+            st.sampled_from([1, 2, 7, 40]),
+            st.sampled_from([None, None, 0.0, 0.3]),
+            st.booleans(),
+        ),
         "chamfer_distance": (strategies.pairs(largest, family),),
+        "f_score": (strategies.pairs(largest, family), st.sampled_from([0.0, 1e-6, 0.1, 1e9])),
         "earth_mover_distance": (strategies.pairs(largest // 2, family),),
         "approxmatch": (strategies.pairs(largest // 2, family),),
         "farthest_point_sample": (
             strategies.recipes(largest, family=family),
             st.integers(0, 40),
             st.sampled_from([0, 0, 0, 1, 40]),
+            st.booleans(),
         ),
         "splat_depth": (renderings(largest, family),),
         "sample_view": (renderings(largest, family),),

@@ -11,6 +11,7 @@ import venv
 from pathlib import Path
 
 import pytest
+import torch
 
 import diffpoint
 
@@ -43,6 +44,28 @@ def test_a_pages_examples_print_what_they_say(page):
     )
     assert tried > 0
     assert failed == 0
+
+
+def lines_here(page: str) -> list[str]:
+    """The calls in the column "here" of the page's tables."""
+    rows = re.findall(r"^\| .* \|$", page, re.MULTILINE)
+    cells = [re.split(r"(?<!`)\|(?!`)", row)[2].strip() for row in rows]
+    return [cell.strip("`") for cell in cells if cell.startswith("`")]
+
+
+def test_the_calls_for_users_of_other_libraries_run():
+    page = ROOT / "docs" / "coming-from.md"
+    lines = lines_here(page.read_text(encoding="utf-8"))
+    assert len(lines) > 30
+    assert all("dp." in line or "_each" in line or "camera" in line for line in lines)
+    names: dict[str, object] = {}
+    exec(compile(python_blocks(page)[0], page.name, "exec"), names)
+    for line in lines:
+        exec(compile(line, line, "exec"), names)
+    assert names["loss"].ndim == 0
+    assert names["f"].shape == names["precision"].shape == (2,)
+    assert names["dist1"].shape == (2, 300)
+    assert names["index"].dtype == torch.int64
 
 
 def test_every_public_name_has_its_place_in_the_reference():

@@ -179,8 +179,18 @@ def stacks(dtype: torch.dtype) -> Leaves:
 
 CASES = {
     "nearest": two_sets("nearest"),
+    "knn": two_sets("knn", k=5),
+    "knn, more than there are": two_sets("knn", k=30, radius=0.6),
+    "knn, exclude_self": Case(
+        lambda dtype: sets(dtype)[1:],
+        lambda a: dp.knn(a, a, 4, exclude_self=True),
+        lambda a: reference.knn(a, a, 4, exclude_self=True),
+    ),
     "chamfer_distance": two_sets("chamfer_distance", squared=False),
     "chamfer_distance, squared": two_sets("chamfer_distance", squared=True),
+    "chamfer_distance, sum": two_sets("chamfer_distance", squared=False, reduction="sum"),
+    "chamfer_distance, max": two_sets("chamfer_distance", squared=True, reduction="max"),
+    "chamfer_distance, none": two_sets("chamfer_distance", squared=False, reduction="none"),
     "earth_mover_distance": Case(
         sets,
         lambda a, b: dp.earth_mover_distance(a, b, a_lengths=LENGTHS, tolerance=1e-7)[:2],

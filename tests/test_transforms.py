@@ -30,6 +30,7 @@ OTHER = torch.rand(2, 7, 3, generator=torch.Generator().manual_seed(1)) - 0.5
 # Public functions of one batch of clouds that return floats.
 FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "nearest": lambda x: dp.nearest(x, OTHER).squared_distance,
+    "knn": lambda x: dp.knn(x, x, 2, exclude_self=True).squared_distance,
     "chamfer_distance": lambda x: sum(dp.chamfer_distance(x, OTHER, squared=False)),
     "earth_mover_distance": lambda x: dp.earth_mover_distance(x, OTHER).cost,
     "approxmatch": lambda x: dp.approxmatch(x, OTHER),

@@ -11,7 +11,7 @@ import importlib
 from collections.abc import Callable
 
 _MODULES = {
-    "nearest": ("nearest", "nearest_backward", "nearest_both", "nearest_both_backward"),
+    "nearest": ("nearest", "nearest_backward", "nearest_both", "nearest_both_backward", "shares_within"),
     "splat": ("splat", "splat_backward"),
     "sampling": ("farthest_point_sample",),
     "softmatch": ("approxmatch",),

@@ -131,6 +131,21 @@ def nearest_both(
     return result
 
 
+def shares_within(
+    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, threshold: float
+) -> tuple[Tensor, Tensor]:
+    """As the operator."""
+    from_a, _ = _nearest(a, b, a_lengths, b_lengths)
+    from_b, _ = _nearest(b, a, b_lengths, a_lengths)
+    shares = []
+    for squared_distance, lengths in ((from_a, a_lengths), (from_b, b_lengths)):
+        counts = torch.arange(squared_distance.shape[1], device=a.device) < lengths[:, None]
+        within = (squared_distance.sqrt() <= threshold) & counts
+        shares.append(within.sum(-1).to(a.dtype) / lengths)
+    _check("f_score", a, b, a_lengths, b_lengths, smallest=1)
+    return shares[0], shares[1]
+
+
 def nearest_backward(
     a: Tensor, b: Tensor, index: Tensor, grad_squared_distance: Tensor
 ) -> tuple[Tensor, Tensor]:

@@ -16,37 +16,70 @@ _TILE = 4096  # points at once where they do not
 
 
 @triton.jit
-def _farthest(points, lengths, chosen, size, picks, start, BLOCK: tl.constexpr):
+def _limits(lengths, counts, starts, not_in_range, too_many, cloud, size, allow_fewer):
+    """Length, number of points to choose and first point of a cloud, within what it has; counts what is not."""
+    length = tl.load(lengths + cloud)
+    count = tl.load(counts + cloud)
+    start = tl.load(starts + cloud)
+    if length < 0 or length > size:
+        tl.atomic_add(not_in_range, 1)
+    if count < 0 or (count > length and allow_fewer == 0) or start < 0 or start > tl.maximum(length - 1, 0):
+        tl.atomic_add(too_many, 1)
+    length = tl.maximum(tl.minimum(length, size), 0)
+    start = tl.maximum(tl.minimum(start, length - 1), 0)
+    return length.to(tl.int32), tl.minimum(count, length).to(tl.int32), start.to(tl.int32)
+
+
+@triton.jit
+def _farthest(
+    points,
+    lengths,
+    counts,
+    starts,
+    chosen,
+    not_in_range,
+    too_many,
+    size,
+    width,
+    allow_fewer,
+    BLOCK: tl.constexpr,
+):
     cloud = tl.program_id(0).to(tl.int64)
+    length, count, current = _limits(
+        lengths, counts, starts, not_in_range, too_many, cloud, size, allow_fewer
+    )
     points += cloud * size * 3
-    length = tl.minimum(tl.load(lengths + cloud), size)
     i = tl.arange(0, BLOCK)
     inside = i < length
     x = tl.load(points + i * 3, mask=inside, other=0.0)
     y = tl.load(points + i * 3 + 1, mask=inside, other=0.0)
     z = tl.load(points + i * 3 + 2, mask=inside, other=0.0)
     distance = tl.where(inside, float("inf"), -1.0).to(x.dtype)
-    current = tl.minimum(start, size - 1)
-    for pick in range(picks):
-        tl.store(chosen + cloud * picks + pick, current.to(tl.int64))
+    for pick in range(tl.minimum(count, width)):
+        tl.store(chosen + cloud * width + pick, current.to(tl.int64))
         dx = x - tl.load(points + current * 3)
         dy = y - tl.load(points + current * 3 + 1)
         dz = z - tl.load(points + current * 3 + 2)
         distance = tl.minimum(distance, dx * dx + dy * dy + dz * dz)
+        distance = tl.where(i == current, -1.0, distance)  # not chosen twice
         current = tl.argmax(distance, axis=0)  # of equal distances the first
 
 
 @triton.jit
-def _farthest_of_many(points, lengths, distance, chosen, size, picks, start, TILE: tl.constexpr):
+def _farthest_of_many(
+    points, lengths, counts, starts, distance, chosen, not_in_range, too_many, size, width, allow_fewer,
+    TILE: tl.constexpr,
+):  # fmt: skip
     """As `_farthest`, with the distances in memory. Lanes keep the best of their own points until the end of a pass."""
     cloud = tl.program_id(0).to(tl.int64)
+    length, count, current = _limits(
+        lengths, counts, starts, not_in_range, too_many, cloud, size, allow_fewer
+    )
     points += cloud * size * 3
     distance += cloud * size
-    length = tl.minimum(tl.load(lengths + cloud), size).to(tl.int32)
     dtype: tl.constexpr = points.dtype.element_ty
-    current = tl.minimum(start, size - 1)
-    for pick in range(picks):
-        tl.store(chosen + cloud * picks + pick, current.to(tl.int64))
+    for pick in range(tl.minimum(count, width)):
+        tl.store(chosen + cloud * width + pick, current.to(tl.int64))
         px = tl.load(points + current * 3)
         py = tl.load(points + current * 3 + 1)
         pz = tl.load(points + current * 3 + 2)
@@ -60,6 +93,7 @@ def _farthest_of_many(points, lengths, distance, chosen, size, picks, start, TIL
             dz = tl.load(points + i * 3 + 2, mask=inside, other=0.0) - pz
             before = tl.load(distance + i, mask=inside & (pick > 0), other=float("inf"))
             least = tl.minimum(before, dx * dx + dy * dy + dz * dz)
+            least = tl.where(i == current, -1.0, least)  # not chosen twice
             tl.store(distance + i, least, mask=inside)
             farther = inside & (least > best)
             best = tl.where(farther, least, best)
@@ -69,27 +103,33 @@ def _farthest_of_many(points, lengths, distance, chosen, size, picks, start, TIL
         current = tl.minimum(tl.min(candidates, axis=0), size - 1)
 
 
-def farthest_point_sample(points: Tensor, lengths: Tensor, k: int, start: int) -> Tensor:
-    """As the operator."""
+def farthest_point_sample(
+    points: Tensor, lengths: Tensor, counts: Tensor, starts: Tensor, width: int, allow_fewer: bool
+) -> Tensor:
+    """As the operator. With a `width` below 0 it waits for the GPU, for the largest of `counts`."""
     batch, size, _ = points.shape
-    chosen = lengths.new_empty((batch, k))
     function = "farthest_point_sample"
-
-    def name_it() -> None:
-        _checks.check_picks(lengths, size, k, start)
-        _checks.check_finite(function, "points", points, lengths)
-
-    if chosen.numel():
-        if size == 0:
-            name_it()
-        count_bad_points(function, "points", points, lengths, smallest=max(k, start + 1))
+    if width < 0:
+        width = int(counts.max()) if batch else 0
+    chosen = lengths.new_full((batch, width), -1)
+    if batch:
+        count_bad_points(function, "points", points, lengths)
+        counters = [
+            errors.counter(points, function, *kind) for kind in (("lengths", "length"), ("k", "picks"))
+        ]
+        inputs = points, lengths, counts, starts
+        sizes = size, width, int(allow_fewer)
         if size <= _REGISTERS:
             block = max(64, triton.next_power_of_2(size))
             warps = 4 if block <= 1024 else 8 if block <= 2048 else 16
-            launch(_farthest, batch, points, lengths, chosen, size, k, start, block, warps=warps)
+            launch(_farthest, batch, *inputs, chosen, *counters, *sizes, block, warps=warps)
         else:
             distance = points.new_empty((batch, size))
-            inputs = points, lengths, distance, chosen, size, k, start
-            launch(_farthest_of_many, batch, *inputs, _TILE, warps=16)
-        errors.settle(points, name_it)
+            launch(_farthest_of_many, batch, *inputs, distance, chosen, *counters, *sizes, _TILE, warps=16)
+
+    def name_it() -> None:
+        _checks.check_picks(lengths, size, counts, starts, allow_fewer=allow_fewer)
+        _checks.check_finite(function, "points", points, lengths)
+
+    errors.settle(points, name_it)
     return chosen

@@ -7,6 +7,7 @@ from diffpoint.kernels._backend import ti
 BLOCK = 32  # points in a box
 GROUP = 32  # boxes in a box of boxes
 LANES = 16  # boxes in a vector
+ROWS = GROUP // LANES  # rows of boxes in a group
 
 
 def build(real):
@@ -115,3 +116,58 @@ def build(real):
                         groups[cloud, k + 3, group] = greatest[k]
 
     return SimpleNamespace(sort=sort)
+
+
+def box_tests(real):
+    """Functions by which a search chooses its boxes, for a tile of queries that lie in the box from `low` to `high`."""
+
+    @ti.func
+    def clamped(x, least, greatest):
+        """`x` clamped to the interval from `least` to `greatest`."""
+        y = ti.select(x < least, least, x)
+        return ti.select(y > greatest, greatest, y)
+
+    @ti.func
+    def gap(corners: ti.template(), cloud, box, low: ti.template(), high: ti.template()):
+        """Squared distance between a box and the box from `low` to `high`."""
+        total = real(0.0)
+        for k in ti.static(range(3)):
+            below = corners[cloud, k, box] - high[k]
+            above = low[k] - corners[cloud, k + 3, box]
+            outside = ti.select(below > above, below, above)
+            outside = ti.select(outside > 0, outside, real(0.0))
+            total += outside * outside
+        return total
+
+    @ti.func
+    def reached(boxes: ti.template(), cloud, row, low: ti.template(), high: ti.template(), farthest):
+        """Bit s: box s of a row of 16 is within the squared distance `farthest` of the box from `low` to `high`."""
+        total = ti.Vector([real(0.0) for s in ti.static(range(LANES))])
+        for k in ti.static(range(3)):
+            below = boxes[cloud, k, row] - high[k]
+            above = low[k] - boxes[cloud, k + 3, row]
+            for s in ti.static(range(LANES)):
+                outside = ti.select(below[s] > above[s], below[s], above[s])
+                outside = ti.select(outside > 0, outside, real(0.0))
+                total[s] += outside * outside
+        bits = 0
+        for s in ti.static(range(LANES)):
+            bits |= ti.select(total[s] <= farthest, 1 << s, 0)
+        return bits
+
+    @ti.func
+    def most_central(corners: ti.template(), cloud, start, end, low: ti.template(), high: ti.template()):
+        """Of the boxes `start` to `end`, the one whose centre is nearest to that of the box `low` to `high`."""
+        least = real(ti.math.inf)
+        best = start
+        for box in range(start, end):
+            d = real(0.0)
+            for k in ti.static(range(3)):
+                offset = corners[cloud, k, box] + corners[cloud, k + 3, box] - (low[k] + high[k])
+                d += offset * offset
+            closer = d < least
+            best = ti.select(closer, box, best)
+            least = ti.select(closer, d, least)
+        return best
+
+    return SimpleNamespace(clamped=clamped, gap=gap, reached=reached, most_central=most_central)

@@ -7,10 +7,9 @@ the nearest candidate found so far by each of its queries. Both give the same di
 from types import SimpleNamespace
 
 from diffpoint.kernels._backend import ti
-from diffpoint.kernels.blocks import BLOCK, GROUP, LANES
+from diffpoint.kernels.blocks import BLOCK, GROUP, LANES, ROWS, box_tests
 
 CHUNK = 32  # candidates between two updates of the winning chunk
-ROWS = GROUP // LANES  # rows of boxes in a group
 BOX_TILE = 16  # queries that are compared with the boxes together; 32 are no faster and compile twice as long
 
 
@@ -23,54 +22,8 @@ def build(real):
     orders = ti.types.ndarray(dtype=ti.i32, ndim=2)
     lanes3 = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=3)
 
-    @ti.func
-    def clamped(x, least, greatest):
-        """`x` clamped to the interval from `least` to `greatest`."""
-        y = ti.select(x < least, least, x)
-        return ti.select(y > greatest, greatest, y)
-
-    @ti.func
-    def gap(corners: ti.template(), cloud, box, low: ti.template(), high: ti.template()):
-        """Squared distance between a box and the box from `low` to `high`."""
-        total = real(0.0)
-        for k in ti.static(range(3)):
-            below = corners[cloud, k, box] - high[k]
-            above = low[k] - corners[cloud, k + 3, box]
-            outside = ti.select(below > above, below, above)
-            outside = ti.select(outside > 0, outside, real(0.0))
-            total += outside * outside
-        return total
-
-    @ti.func
-    def reached(boxes: ti.template(), cloud, row, low: ti.template(), high: ti.template(), farthest):
-        """Bit s: box s of a row of 16 is within the squared distance `farthest` of the box from `low` to `high`."""
-        total = ti.Vector([real(0.0) for s in ti.static(range(LANES))])
-        for k in ti.static(range(3)):
-            below = boxes[cloud, k, row] - high[k]
-            above = low[k] - boxes[cloud, k + 3, row]
-            for s in ti.static(range(LANES)):
-                outside = ti.select(below[s] > above[s], below[s], above[s])
-                outside = ti.select(outside > 0, outside, real(0.0))
-                total[s] += outside * outside
-        bits = 0
-        for s in ti.static(range(LANES)):
-            bits |= ti.select(total[s] <= farthest, 1 << s, 0)
-        return bits
-
-    @ti.func
-    def most_central(corners: ti.template(), cloud, start, end, low: ti.template(), high: ti.template()):
-        """Of the boxes `start` to `end`, the one whose centre is nearest to that of the box `low` to `high`."""
-        least = real(ti.math.inf)
-        best = start
-        for box in range(start, end):
-            d = real(0.0)
-            for k in ti.static(range(3)):
-                offset = corners[cloud, k, box] + corners[cloud, k + 3, box] - (low[k] + high[k])
-                d += offset * offset
-            closer = d < least
-            best = ti.select(closer, box, best)
-            least = ti.select(closer, d, least)
-        return best
+    tests = box_tests(real)
+    clamped, gap, reached, most_central = tests.clamped, tests.gap, tests.reached, tests.most_central
 
     @ti.kernel
     def forward(
@@ -265,18 +218,22 @@ def build(real):
         grad_b: clouds,
         spread: ti.i32,
     ):
+        """`index` and `grad_squared_distance` hold as many entries for each point of `a` as it has neighbours."""
         # One thread per cloud adds to the gradients in a fixed order, without atomics.
         for step in range(a.shape[0] * spread):
             if step % spread == 0:
                 cloud = step // spread
+                neighbours = index.shape[1] // a.shape[1]
                 for i in range(a.shape[1]):
-                    j = ti.cast(index[cloud, i], ti.i32)
-                    if j >= 0:
-                        g = real(2.0) * grad_squared_distance[cloud, i]
-                        for k in ti.static(range(3)):
-                            component = g * (a[cloud, i, k] - b[cloud, j, k])
-                            # Not +=, which would be an atomic addition.
-                            grad_a[cloud, i, k] = grad_a[cloud, i, k] + component
-                            grad_b[cloud, j, k] = grad_b[cloud, j, k] - component
+                    for q in range(neighbours):
+                        entry = i * neighbours + q
+                        j = ti.cast(index[cloud, entry], ti.i32)
+                        if j >= 0:
+                            g = real(2.0) * grad_squared_distance[cloud, entry]
+                            for k in ti.static(range(3)):
+                                component = g * (a[cloud, i, k] - b[cloud, j, k])
+                                # Not +=, which would be an atomic addition.
+                                grad_a[cloud, i, k] = grad_a[cloud, i, k] + component
+                                grad_b[cloud, j, k] = grad_b[cloud, j, k] - component
 
     return SimpleNamespace(forward=forward, forward_blocks=forward_blocks, backward=backward)

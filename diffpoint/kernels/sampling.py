@@ -13,6 +13,8 @@ def build(real):
     points3 = ti.types.ndarray(dtype=real, ndim=3)
     lanes2 = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=2)
     indices2 = ti.types.ndarray(dtype=ti.i64, ndim=2)
+    scalars2 = ti.types.ndarray(dtype=real, ndim=2)
+    counts1 = ti.types.ndarray(dtype=ti.i64, ndim=1)
 
     @ti.kernel
     def farthest(
@@ -21,17 +23,23 @@ def build(real):
         y_lanes: lanes2,
         z_lanes: lanes2,
         distance: lanes2,
+        distance_of: scalars2,
+        counts: counts1,
+        starts: counts1,
         chosen: indices2,
-        start: ti.i32,
         spread: ti.i32,
     ):
-        """`distance` must be +inf for points and -1 for padding, which is therefore never the farthest."""
+        """`distance` must be +inf for points and -1 for padding, which is therefore never the farthest.
+
+        `distance_of` is the same memory. Chosen points get -1 too, so that none is chosen twice.
+        """
         for step in range(points.shape[0] * spread):
             if step % spread == 0:
                 cloud = step // spread
-                current = start
-                for k in range(chosen.shape[1]):
+                current = ti.cast(starts[cloud], ti.i32)
+                for k in range(ti.cast(counts[cloud], ti.i32)):
                     chosen[cloud, k] = current
+                    distance_of[cloud, current] = real(-1.0)
                     x = points[cloud, current, 0]
                     y = points[cloud, current, 1]
                     z = points[cloud, current, 2]
@@ -60,7 +68,6 @@ def build(real):
                         best = ti.select(better, d, best)
 
     boxes3 = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=3)
-    scalars2 = ti.types.ndarray(dtype=real, ndim=2)
     orders2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
     @ti.kernel
@@ -72,16 +79,19 @@ def build(real):
         order: orders2,
         box_lanes: boxes3,
         distance: lanes2,
+        distance_of: scalars2,
         box_farthest: scalars2,
         box_farthest_lanes: lanes2,
         box_point: orders2,
+        counts: counts1,
+        starts: counts1,
         chosen: indices2,
-        start: ti.i32,
         spread: ti.i32,
     ):
-        """`points`, `order`, `box_lanes` as sorted by `blocks.sort`; `distance` +inf, and -1 in the padding.
+        """`points`, `order`, `box_lanes` as sorted by `blocks.sort`; `distance` and `distance_of` as above.
 
-        A new point changes distances only in boxes that are nearer to it than the largest distance in them. In a tie
+        A new point changes distances only in boxes that are nearer to it than the largest distance in them, and in its
+        own, which may be as near. In a tie
         the lowest index before sorting is chosen, as in the plain algorithm: the first within a box, because points
         keep their order there.
         """
@@ -90,12 +100,13 @@ def build(real):
                 cloud = step // spread
                 current = 0
                 for i in range(order.shape[1]):
-                    if order[cloud, i] == start:
+                    if order[cloud, i] == starts[cloud]:
                         current = i
                 for box in range(box_farthest.shape[1]):
                     box_farthest[cloud, box] = distance[cloud, box * PARTS].max()
-                for k in range(chosen.shape[1]):
+                for k in range(ti.cast(counts[cloud], ti.i32)):
                     chosen[cloud, k] = order[cloud, current]
+                    distance_of[cloud, current] = real(-1.0)
                     x = points[cloud, current, 0]
                     y = points[cloud, current, 1]
                     z = points[cloud, current, 2]
@@ -115,7 +126,7 @@ def build(real):
                         farthest_lanes = box_farthest_lanes[cloud, t]
                         reached = 0  # a bit for each box
                         for s in ti.static(range(LANES)):
-                            reached |= ti.select(gap[s] < farthest_lanes[s], 1 << s, 0)
+                            reached |= ti.select(gap[s] <= farthest_lanes[s], 1 << s, 0)
                         if reached != 0:
                             while reached != 0:
                                 box = t * LANES + ti.math.popcnt((reached & -reached) - 1)

@@ -48,6 +48,49 @@ def check_nearest(recipes: tuple[strategies.Recipe, strategies.Recipe]) -> str:
     return AGREED
 
 
+def check_knn(
+    recipes: tuple[strategies.Recipe, strategies.Recipe], k: int, radius: float | None, exclude_self: bool
+) -> str:
+    a, b = (r.make() for r in recipes)
+    if exclude_self:
+        b = a
+    lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
+    result = refuse_or_run(
+        lambda: dp.knn(a.points, b.points, k, radius=radius, exclude_self=exclude_self, **lengths),
+        a.poisoned or b.poisoned,
+        "knn",
+    )
+    if result is None:
+        return REFUSED
+    x, y = a.clean, b.clean
+    every, _ = reference.knn(x, y, k, exclude_self=exclude_self, **lengths)
+    inside = (torch.arange(x.shape[-2]) < a.counts[..., None])[..., None]
+    real = result.index >= 0
+    if radius is None:
+        assert_within(result.squared_distance, every, 16 * eps(x.dtype) * every)
+        available = (b.counts - int(exclude_self)).clamp(0, k)[..., None]
+        assert torch.equal(real.sum(-1), torch.where(inside[..., 0], available, 0))
+    else:
+        surely, perhaps = (every <= radius**2 * (1 + sign * 16 * eps(x.dtype)) for sign in (-1, 1))
+        assert (real >= surely & inside).all()
+        assert (real <= perhaps & inside).all()
+        assert_within(result.squared_distance[real], every[real], 16 * eps(x.dtype) * every[real])
+        assert (result.squared_distance[~real & inside.expand(real.shape)] == torch.inf).all()
+    assert (result.squared_distance.diff(dim=-1)[real[..., 1:]] >= 0).all()
+    assert (result.index < b.counts[..., None, None]).all()
+    if real.any():
+        chosen = y.unsqueeze(-3).expand(*x.shape[:-1], *y.shape[-2:])
+        chosen = torch.take_along_dim(chosen, result.index.clamp(min=0)[..., None], -2)
+        attained = (x[..., None, :] - chosen).double().square().sum(-1)
+        assert_within(attained[real], every[real].double(), 16 * eps(x.dtype) * every[real])
+        equal = (chosen[..., 1:, :] == chosen[..., :-1, :]).all(-1) & real[..., 1:]
+        assert (result.index.diff(dim=-1)[equal] > 0).all(), "the lowest of equals first"
+        if exclude_self:
+            assert (result.index != torch.arange(x.shape[-2])[:, None])[real].all()
+        assert_finite_gradients(result.squared_distance, *{a.points, b.points})
+    return AGREED
+
+
 def _empty(*clouds: strategies.Cloud) -> bool:
     """Whether one of them has a set without points. A batch of no sets has none."""
     return any(bool((c.counts == 0).any()) for c in clouds)
@@ -69,6 +112,27 @@ def check_chamfer_distance(recipes: tuple[strategies.Recipe, strategies.Recipe])
         for ours, theirs in zip(result, expected, strict=True):
             assert_within(ours, theirs, 100 * eps(ours.dtype) * theirs)
         assert_finite_gradients(torch.stack(result), a.points, b.points)
+    return AGREED
+
+
+def check_f_score(recipes: tuple[strategies.Recipe, strategies.Recipe], threshold: float) -> str:
+    a, b = (r.make() for r in recipes)
+    lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
+    result = refuse_or_run(
+        lambda: dp.f_score(a.points, b.points, threshold, **lengths),
+        a.poisoned or b.poisoned or _empty(a, b),
+        "f_score",
+    )
+    if result is None:
+        return REFUSED
+    # Rounding decides for distances at the threshold.
+    fewest, most = (
+        reference.f_score(a.clean, b.clean, threshold * (1 + sign * 16 * eps(a.clean.dtype)), **lengths)
+        for sign in (-1, 1)
+    )
+    for low, value, high in zip(fewest, result, most, strict=True):
+        assert (low <= value * (1 + 8 * eps(value.dtype))).all()
+        assert (value <= high * (1 + 8 * eps(value.dtype))).all()
     return AGREED
 
 
@@ -131,12 +195,15 @@ def check_approxmatch(recipes: tuple[strategies.Recipe, strategies.Recipe]) -> s
     return AGREED
 
 
-def check_farthest_point_sample(recipe: strategies.Recipe, k: int, start: int) -> str:
+def check_farthest_point_sample(recipe: strategies.Recipe, k: int, start: int, allow_fewer: bool) -> str:
     cloud = recipe.make()
     smallest = int(cloud.counts.min()) if cloud.counts.numel() else 0
-    refuse = cloud.counts.numel() > 0 and (cloud.poisoned or k > smallest or start > max(smallest - 1, 0))
+    too_many = k > smallest and not allow_fewer
+    refuse = cloud.counts.numel() > 0 and (cloud.poisoned or too_many or start > max(smallest - 1, 0))
     chosen = refuse_or_run(
-        lambda: dp.farthest_point_sample(cloud.points, k, start=start, lengths=cloud.lengths),
+        lambda: dp.farthest_point_sample(
+            cloud.points, k, start=start, lengths=cloud.lengths, allow_fewer=allow_fewer
+        ),
         refuse,
         "farthest_point_sample",
     )
@@ -150,10 +217,14 @@ def check_farthest_point_sample(recipe: strategies.Recipe, k: int, start: int) -
     points, rows = cloud.clean.reshape(batch, recipe.count, 3), chosen.reshape(batch, k)
     for whole, n, row in zip(points, cloud.counts.flatten().tolist(), rows, strict=True):
         real = whole[:n]
+        assert (row[n:] == -1).all()
+        row = row[:n]
+        assert len(row.unique()) == len(row) == min(k, n)
         distance = torch.full((n,), torch.inf, dtype=torch.float64)
         for step, i in enumerate(row.tolist()):
             assert i == start if step == 0 else distance[i] >= distance.max() * (1 - 16 * eps(recipe.dtype))
             if step:
                 assert not (real[:i] == real[i]).all(-1).any() or distance[i] == 0, "the lowest of equals"
             distance = torch.minimum(distance, (real - real[i]).double().square().sum(-1))
+            distance[i] = -1  # none is chosen twice
     return AGREED

@@ -165,7 +165,7 @@ def _medoid(clouds: Tensor) -> Tensor:
     for other in range(1, len(by_number)):
         among = by_number[:other]
         pair = chamfer_distance(among, by_number[other].expand_as(among), squared=False)
-        distances[:other, other] = distances[other, :other] = pair.a_to_b + pair.b_to_a
+        distances[:other, other] = distances[other, :other] = pair.total
     return distances.sum(1).argmin(0)
 
 

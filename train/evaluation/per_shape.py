@@ -154,7 +154,7 @@ def distance_to_nearest(clouds: Tensor, among: Tensor) -> Tensor:
     found = []
     for cloud in clouds:
         distance = chamfer_distance(cloud.expand(len(among), -1, -1).contiguous(), among, squared=False)
-        found.append(100 * (distance.a_to_b + distance.b_to_a).amin())
+        found.append(100 * distance.total.amin())
     return torch.stack(found)
 
 

@@ -30,7 +30,7 @@ def medoid(points: Tensor) -> int:
     totals = thin.new_zeros(len(index))
     for row in range(len(index)):
         distance = chamfer_distance(thin[row].expand_as(thin).contiguous(), thin, squared=False)
-        totals[row] = (distance.a_to_b + distance.b_to_a).sum()
+        totals[row] = distance.total.sum()
     return int(index[totals.argmin()])
 
 

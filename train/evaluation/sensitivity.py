@@ -54,4 +54,4 @@ def sensitivity(model: Predictor, images: Tensor, *, seed: int = 0) -> Sensitivi
 
 def _mean_cd100(a: Tensor, b: Tensor) -> float:
     distance = chamfer_distance(a.contiguous(), b.contiguous(), squared=False)
-    return 100 * (distance.a_to_b + distance.b_to_a).mean().item()
+    return 100 * distance.total.mean().item()

@@ -210,7 +210,7 @@ def cloud_distances(
     """
     if distance == "chamfer":
         both = chamfer_distance(clouds, targets.expand(len(clouds), *targets.shape), squared=False)
-        return 100 * (both.a_to_b + both.b_to_a)
+        return 100 * both.total
     every = max(1, targets.shape[1] // clouds.shape[2])
     thin = targets[:, step % every :: every][:, : clouds.shape[2]]
     thin = thin.expand(len(clouds), *thin.shape).contiguous()

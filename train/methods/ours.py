@@ -146,7 +146,7 @@ def autoencoder_loss(state: TrainState, clouds: Tensor, noise: Noise, step: Step
     rebuilt = step.timer.mark_in_backward(state.autoencoder(clouds), "distances")
     step.timer.mark("network")
     distance = chamfer_distance(rebuilt, clouds, squared=False)
-    loss = (distance.a_to_b + distance.b_to_a).mean()
+    loss = distance.total.mean()
     step.timer.mark("distances")
     return {"loss": loss, "cd": 100 * loss}
 
