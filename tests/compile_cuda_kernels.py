@@ -25,7 +25,9 @@ def main() -> None:
             for p, value in zip(kernel.params, launch["arguments"], strict=True)
         }
         constants = {
-            p.name: given[p.name] for p in kernel.params if p.is_constexpr or not isinstance(given[p.name], str)
+            p.name: given[p.name]
+            for p in kernel.params
+            if p.is_constexpr or not isinstance(given[p.name], str)
         }
         signature = {name: "constexpr" if name in constants else value for name, value in given.items()}
         for architecture in ARCHITECTURES:

@@ -75,13 +75,16 @@ def _gradient(
     gy = tl.zeros((QUERIES,), a.dtype.element_ty)
     gz = tl.zeros((QUERIES,), a.dtype.element_ty)
     if OWN:
-        j = tl.load(from_a + row * size_a + i, mask=inside, other=-1)
-        matched = j >= 0
-        own = inside & matched
-        g = 2.0 * tl.load(grad_from_a + row * size_a + i, mask=own, other=0.0)
-        gx = g * (tl.load(a + i * 3, mask=own, other=0.0) - tl.load(b + j * 3, mask=own, other=0.0))
-        gy = g * (tl.load(a + i * 3 + 1, mask=own, other=0.0) - tl.load(b + j * 3 + 1, mask=own, other=0.0))
-        gz = g * (tl.load(a + i * 3 + 2, mask=own, other=0.0) - tl.load(b + j * 3 + 2, mask=own, other=0.0))
+        to = tl.load(from_a + row * size_a + i, mask=inside, other=-1)
+        own = inside & (to >= 0)
+        scale = 2.0 * tl.load(grad_from_a + row * size_a + i, mask=own, other=0.0)
+        gx = scale * (tl.load(a + i * 3, mask=own, other=0.0) - tl.load(b + to * 3, mask=own, other=0.0))
+        gy = scale * (
+            tl.load(a + i * 3 + 1, mask=own, other=0.0) - tl.load(b + to * 3 + 1, mask=own, other=0.0)
+        )
+        gz = scale * (
+            tl.load(a + i * 3 + 2, mask=own, other=0.0) - tl.load(b + to * 3 + 2, mask=own, other=0.0)
+        )
     if OTHERS:
         sum_x = tl.zeros((QUERIES, CANDIDATES), a.dtype.element_ty)
         sum_y = tl.zeros((QUERIES, CANDIDATES), a.dtype.element_ty)
