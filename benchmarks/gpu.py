@@ -82,10 +82,9 @@ def _machine() -> dict[str, Any]:
 Way = tuple[str, Callable[[], Any]]
 
 
-def _ops(stop: float) -> Iterator[dict[str, Any]]:
-    """Milliseconds of each op, whole batch: ours on the GPU, peers there, ours on the CPU."""
-    dp.configure(checks="deferred")
-    for op, size, mark, ours, peers, agreement in _races():
+def _ops(stop: float, device: str = "cuda", clouds: int = 80, points: int = 2048) -> Iterator[dict[str, Any]]:
+    """Milliseconds of each op and its peers on the GPU, whole batch, and how far ours is from the CPU's result."""
+    for op, size, mark, ours, peers, agreement in _races(device, clouds, points):
         if time.monotonic() > stop:
             yield {"left out": f"{op} and those after it: no time left"}
             return
@@ -105,19 +104,26 @@ def _milliseconds(run: Callable[[], Any]) -> float:
         run()
     times = []
     for _ in range(_ROUNDS):
-        torch.cuda.synchronize()
+        _finish()
         begin = time.perf_counter()
         run()
-        torch.cuda.synchronize()
+        _finish()
         times.append(1e3 * (time.perf_counter() - begin))
         if sum(times) > 3000:
             break
     return statistics.median(times)
 
 
-def _races() -> Iterator[tuple[str, str, float | None, Callable, list[Way], Callable[[], str]]]:
+def _finish() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def _races(
+    device: str, clouds: int, points: int
+) -> Iterator[tuple[str, str, float | None, Callable, list[Way], Callable[[], str]]]:
     """Name, size, time to reach in milliseconds, our call, calls of peers, and how much ours differs from the CPU."""
-    a, b = (x.cuda() for x in pairs(80, 2048, 2048))
+    a, b = (x.to(device) for x in pairs(clouds, points, points))
     a_few, b_few = a[:4].cpu(), b[:4].cpu()
 
     def chamfer(x: Tensor = a, y: Tensor = b) -> Tensor:
@@ -138,7 +144,7 @@ def _races() -> Iterator[tuple[str, str, float | None, Callable, list[Way], Call
 
     keops = optional("pykeops.torch")
     peers: list[Way] = [("torch.cdist", by_cdist)] + ([("pykeops", by_keops)] if keops else [])
-    size = "80 x 2048 x 2048"
+    size = f"{clouds} x {points} x {points}"
     yield (
         "chamfer", size, 0.6, chamfer, peers,
         lambda: _apart(chamfer(a[:4], b[:4]), chamfer(a_few, b_few)),
@@ -149,7 +155,7 @@ def _races() -> Iterator[tuple[str, str, float | None, Callable, list[Way], Call
         lambda: _apart(with_gradient(chamfer, a[:4], b[:4])[0], with_gradient(chamfer, a_few, b_few)[0]),
     )  # fmt: skip
 
-    x, y = (x.cuda() for x in pairs(160, 2048, 2048))
+    x, y = (x.to(device) for x in pairs(2 * clouds, points, points))
 
     def emd(x: Tensor = x, y: Tensor = y) -> Tensor:
         return dp.earth_mover_distance(x, y, tolerance=0.005).cost
@@ -160,50 +166,50 @@ def _races() -> Iterator[tuple[str, str, float | None, Callable, list[Way], Call
         loss = geomloss.SamplesLoss("sinkhorn", p=1, blur=0.005, backend="tensorized")
         sinkhorn = [("geomloss sinkhorn, 8 of 160", lambda: loss(x[:8], y[:8]))]
     yield (
-        "earth mover's distance, error at most 0.5 %", "160 x 2048", 25.0, emd, sinkhorn,
+        "earth mover's distance, error at most 0.5 %", f"{2 * clouds} x {points}", 25.0, emd, sinkhorn,
         lambda: _apart(emd(x[:4], y[:4]), emd(x[:4].cpu(), y[:4].cpu())),
     )  # fmt: skip
 
-    cloud = surfaces(80, 2048).cuda()
+    cloud = surfaces(clouds, points).to(device)
     for side, mark in ((56, 0.1), (224, 0.15)):
-        camera = circle_of_cameras(80, side).to("cuda")
+        camera = circle_of_cameras(clouds, side).to(device)
 
-        def splat(points: Tensor = cloud, camera: dp.PinholeCamera = camera, radius: float = 0.0) -> Tensor:
-            return dp.splat_depth(points, camera, radius=radius).depth
+        def splat(cloud: Tensor = cloud, camera: dp.PinholeCamera = camera, radius: float = 0.0) -> Tensor:
+            return dp.splat_depth(cloud, camera, radius=radius).depth
 
         def compare(splat: Callable = splat, camera: dp.PinholeCamera = camera) -> str:
             return _apart(splat(), splat(cloud.cpu(), camera.to("cpu")))
 
-        yield f"splat, {side} x {side}", "80 x 2048", mark, splat, [], compare
-    for side in (56,):
-        camera = circle_of_cameras(80, side).to("cuda")
-        depth = dp.splat_depth(surfaces(80, 4096, seed=2).cuda(), camera, radius=1.0).depth
+        yield f"splat, {side} x {side}", f"{clouds} x {points}", mark, splat, [], compare
+    for side in (56,):  # also the map's side in training
+        camera = circle_of_cameras(clouds, side).to(device)
+        depth = dp.splat_depth(surfaces(clouds, 2 * points, seed=2).to(device), camera, radius=1.0).depth
         for distance, mark in (("chamfer", None), ("emd", None)):
 
             def front(
-                points: Tensor = cloud, camera: Any = camera, depth: Tensor = depth, distance: Any = distance
+                cloud: Tensor = cloud, camera: Any = camera, depth: Tensor = depth, distance: Any = distance
             ):
-                points = points.detach().requires_grad_()
-                loss = dp.front_terms(points, camera, depth, distance=distance).loss.sum()
-                return torch.autograd.grad(loss, points)[0]
+                cloud = cloud.detach().requires_grad_()
+                loss = dp.front_terms(cloud, camera, depth, distance=distance).loss.sum()
+                return torch.autograd.grad(loss, cloud)[0]
 
             def compare_front(front: Callable = front, camera: Any = camera, depth: Tensor = depth) -> str:
                 return _apart(front(), front(cloud.cpu(), camera.to("cpu"), depth.cpu()))
 
             yield (
                 f"front constraint by {distance}, with gradient",
-                "80 x 2048",
+                f"{clouds} x {points}",
                 mark,
                 front,
                 [],
                 compare_front,
             )
 
-    def farthest(points: Tensor = cloud) -> Tensor:
-        return dp.farthest_point_sample(points, 512)
+    def farthest(cloud: Tensor = cloud) -> Tensor:
+        return dp.farthest_point_sample(cloud, points // 4)
 
     yield (
-        "farthest points, 2048 -> 512", "80 x 2048", 1.5, farthest, [],
+        f"farthest points, {points} -> {points // 4}", f"{clouds} x {points}", 1.5, farthest, [],
         lambda: _apart(farthest(), farthest(cloud.cpu())),
     )  # fmt: skip
 
@@ -244,7 +250,7 @@ def _training(stop: float) -> Iterator[dict[str, Any]]:
     yield _run("data", [*train, "data", "procedural", "--out", data, "--shapes", "120"], stop)
     steps = max(20, int(seconds * 2))  # of about 60 ms, in a third of the time, both stages together
     fit = [*train, "fit", "--data", data, "--out", run, "--profile", "full", "--device", "cuda"]
-    fit += ["--stage1.steps", str(steps), "--stage2.steps", str(steps)]
+    fit += ["--steps", str(steps)]
     yield _run("fit", fit, stop)
     yield _run("evaluate", [*train, "evaluate", run, "--data", data, "--device", "cuda"], stop)
     evaluation = _ROOT / run / "evaluation.json"

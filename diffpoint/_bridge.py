@@ -64,6 +64,8 @@ def register(
     other strides are copied first. With `strided` it also receives tensors that are not contiguous, for instance one
     number expanded. CUDA tensors go to the kernel of the same name in `diffpoint.cuda`; if there is none, and from all
     other devices, they are copied to the CPU, and the results back.
+
+    The batch is the first dimension of every tensor, argument or result: `torch.vmap` enlarges it (see `_transforms`).
     """
 
     def decorate(function: Callable) -> Callable[..., Any]:

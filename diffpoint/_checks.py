@@ -11,14 +11,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._C import _functorch
 
 from diffpoint import _auction
 
 FLOATS = (torch.float32, torch.float64)
 
 defer: Callable[[Tensor, str, str, str], bool] | None = None
-"""Takes over a check of values on a CUDA device, so that nobody waits for its answer: see `cuda.errors.defer`, which
-stands here once a kernel for CUDA has run."""
+"""`cuda.errors.defer`, once a kernel for CUDA has run."""
 
 
 def fail(function: str, argument: str, expected: str, got: str, hint: str = "") -> ValueError:
@@ -30,15 +30,14 @@ def readable(*values: Tensor) -> bool:
     """Whether Python can read values of these: not while torch traces, nor where `torch.vmap` maps over them."""
     if torch.compiler.is_compiling():
         return False
-    return torch._C._functorch.maybe_current_level() is None or not any(_is_mapped(v) for v in values)
+    return _functorch.maybe_current_level() is None or not any(_is_mapped(v) for v in values)
 
 
 def _is_mapped(value: Tensor) -> bool:
-    functorch = torch._C._functorch
-    while functorch.is_functorch_wrapped_tensor(value):
-        if functorch.is_batchedtensor(value):
+    while _functorch.is_functorch_wrapped_tensor(value):
+        if _functorch.is_batchedtensor(value):
             return True
-        value = functorch.get_unwrapped(value)
+        value = _functorch.get_unwrapped(value)
     return False
 
 
@@ -46,7 +45,7 @@ def differentiated(*values: Tensor) -> bool:
     """Whether a gradient with respect to one of these may be asked for; in doubt, yes."""
     if not torch.is_grad_enabled():
         return False
-    transformed = torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None
+    transformed = torch.compiler.is_compiling() or _functorch.maybe_current_level() is not None
     return transformed or any(v.requires_grad for v in values)
 
 
@@ -145,6 +144,11 @@ def check_lengths_range(function: str, name: str, lengths: Tensor, largest: int,
         raise fail(function, name, f"lie in [{smallest}, {largest}]", f"{got} at flat index {at}", hint)
 
 
+def deferred(bad: Tensor, function: str, argument: str, kind: str) -> bool:
+    """Whether an error is raised later if one of these flags is set: on a CUDA device, where a look would wait."""
+    return bad.is_cuda and defer is not None and defer(bad, function, argument, kind)
+
+
 def check_finite(function: str, name: str, value: Tensor, lengths: Tensor | None = None) -> None:
     """No NaN or infinity among the first `lengths` points. A finite sum is enough; only else are all values read.
 
@@ -157,7 +161,7 @@ def check_finite(function: str, name: str, value: Tensor, lengths: Tensor | None
     bad = ~torch.isfinite(value)
     if lengths is not None:
         bad &= (torch.arange(value.shape[-2], device=value.device) < lengths[..., None])[..., None]
-    if value.is_cuda and defer is not None and defer(bad, function, name, "finite"):
+    if deferred(bad, function, name, "finite"):
         return
     if bool(bad.any()):
         where = tuple(bad.nonzero()[0].tolist())
@@ -213,7 +217,7 @@ def check_depth(function: str, name: str, depth: Tensor) -> None:
     if not readable(depth):
         return
     good = depth > 0
-    if depth.is_cuda and defer is not None and defer(~good, function, name, "depth"):
+    if deferred(~good, function, name, "depth"):
         return
     if not bool(good.all()):
         where = tuple((~good).nonzero()[0].tolist())

@@ -7,25 +7,21 @@ comes before the one of `register_autograd`, and handles one level of transforms
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch._functorch.utils import enable_single_level_autograd_function
 from torch.autograd import forward_ad
 from torch.autograd.forward_ad import _set_fwd_grad_enabled
-from torch.autograd.function import _SingleLevelFunction
-
-if TYPE_CHECKING:
-    from torch.library import CustomOpDef
 
 _LIBRARY = torch.library.Library("diffpoint", "FRAGMENT")
 _DEVICES = ("CPU", "CUDA", "Lazy", "Meta", "MPS", "PrivateUse1", "XLA", "XPU")
 
 
-def support(op: CustomOpDef, name: str, backward: Callable | None, setup: Callable | None) -> None:
-    """Register the derivatives and the batching rule of the operator `diffpoint::<name>`.
+def support(op: Any, name: str, backward: Callable | None, setup: Callable | None) -> None:
+    """Register the derivatives and the batching rule of `op`, which torch knows as `diffpoint::<name>`.
 
     Every argument that is a tensor, and every result, has the batch as its first dimension.
     """
@@ -36,11 +32,12 @@ def support(op: CustomOpDef, name: str, backward: Callable | None, setup: Callab
 
 
 def _differentiable(op: Any, name: str, backward: Callable | None, setup: Callable | None) -> Callable:
-    def below(keyset: Any, arguments: tuple) -> Any:
+    def below(keyset: Any, arguments: Sequence) -> Any:
         with torch._C._AutoDispatchBelowAutograd():
             return op.redispatch(keyset & torch._C._after_autograd_keyset, *arguments)
 
-    def forward(ctx: Any, keyset: Any, *arguments: Any) -> Any:
+    def forward(ctx: Any, *arguments_and_keyset: Any) -> Any:
+        *arguments, keyset = arguments_and_keyset
         if torch._C._are_functorch_transforms_active():
             # torch has disabled derivatives for the inside of this function, but the next level takes some too.
             with torch.enable_grad(), _set_fwd_grad_enabled(True):
@@ -50,7 +47,7 @@ def _differentiable(op: Any, name: str, backward: Callable | None, setup: Callab
         outputs = (result,) if isinstance(result, Tensor) else result
         ctx.differentiable = [r.is_floating_point() for r in outputs]
         if setup is not None:
-            setup(ctx, arguments, result)
+            setup(ctx, tuple(arguments), result)
         return result
 
     def pull(ctx: Any, *gradients: Tensor | None) -> Any:
@@ -58,7 +55,7 @@ def _differentiable(op: Any, name: str, backward: Callable | None, setup: Callab
             order = ": it is a first derivative, and there are no second ones" if "_backward" in name else ""
             raise RuntimeError(f"diffpoint: the operator diffpoint.{name} has no autograd formula{order}.")
         result = backward(ctx, *gradients)
-        return None, *(result if isinstance(result, tuple) else (result,))
+        return *(result if isinstance(result, tuple) else (result,)), None
 
     def push(ctx: Any, *tangents: Tensor | None) -> Any:
         if any(ctx.differentiable):
@@ -69,19 +66,22 @@ def _differentiable(op: Any, name: str, backward: Callable | None, setup: Callab
         return tuple(None for _ in ctx.differentiable)
 
     methods = {"forward": forward, "backward": pull, "jvp": push}
-    function = type(
-        f"diffpoint_{name}", (_SingleLevelFunction,), {k: staticmethod(m) for k, m in methods.items()}
+    function: Any = type(
+        f"diffpoint_{name}", (torch.autograd.Function,), {k: staticmethod(m) for k, m in methods.items()}
     )
+
+    # That of `Function` itself stands for all levels at once, and would not be called within one.
+    apply = super(torch.autograd.Function, function).apply
 
     def kernel(keyset: Any, *arguments: Any) -> Any:
         if torch._C._are_functorch_transforms_active():
             with enable_single_level_autograd_function():
-                return function.apply(keyset, *arguments)
+                return apply(*arguments, keyset)
         if forward_ad._current_level < 0 and not (
             torch.is_grad_enabled() and any(isinstance(a, Tensor) and a.requires_grad for a in arguments)
         ):
             return below(keyset, arguments)  # saves 10 us
-        return function.apply(keyset, *arguments)
+        return apply(*arguments, keyset)
 
     return kernel
 

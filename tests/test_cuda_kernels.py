@@ -1,5 +1,6 @@
 """The kernels for CUDA tensors: on a GPU where there is one, else in Triton's interpreter; and compiled without one."""
 
+import math
 import re
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import torch
 from test_operators import operator_arguments
 
 import diffpoint as dp
+from benchmarks import gpu
 
 pytest.importorskip("triton", reason="triton has no wheel here")
 from cuda_launches import DEVICE, ON_GPU, assert_same, compile_launches, on_cpu, on_device, recorded_launches
@@ -249,6 +251,13 @@ def test_the_cpu_never_imports_triton():
         "assert not [m for m in sys.modules if m.startswith('diffpoint.cuda')]"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])
+
+
+@pytest.mark.skipif(ON_GPU, reason="`python -m benchmarks gpu` does it")
+def test_the_benchmark_of_a_gpu_knows_its_calls():
+    """On CPU tensors, so that a mistake in the script does not first show on a borrowed GPU."""
+    for row in on_cpu(lambda: list(gpu._ops(math.inf, "cpu", clouds=2, points=64))):
+        assert isinstance(row["diffpoint"], float) and row["differs"].startswith("0.0e+00"), row
 
 
 # The last test: it compiles what the others have launched.

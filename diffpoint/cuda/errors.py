@@ -24,6 +24,8 @@ _KINDS = {
     "finite": ("be finite", "Look for a division by zero or an exploded update before this call."),
     "length": ("lie between 0 and the number of points", "An empty set has no distance to anything."),
     "depth": ("be positive, and +inf where empty", "If 0 marks empty pixels, fill them with float('inf')."),
+    "last row": ("end in the row [0, ..., 0, 1]", "Divide the matrix by its last entry, or transpose it."),
+    "invertible": ("be invertible", "Is a focal length 0?"),
     "extent": ("span less than 1e18 together with 'b'", "Scale both down."),
 }
 

@@ -75,16 +75,13 @@ def _gradient(
     gy = tl.zeros((QUERIES,), a.dtype.element_ty)
     gz = tl.zeros((QUERIES,), a.dtype.element_ty)
     if OWN:
-        to = tl.load(from_a + row * size_a + i, mask=inside, other=-1)
-        own = inside & (to >= 0)
-        scale = 2.0 * tl.load(grad_from_a + row * size_a + i, mask=own, other=0.0)
-        gx = scale * (tl.load(a + i * 3, mask=own, other=0.0) - tl.load(b + to * 3, mask=own, other=0.0))
-        gy = scale * (
-            tl.load(a + i * 3 + 1, mask=own, other=0.0) - tl.load(b + to * 3 + 1, mask=own, other=0.0)
-        )
-        gz = scale * (
-            tl.load(a + i * 3 + 2, mask=own, other=0.0) - tl.load(b + to * 3 + 2, mask=own, other=0.0)
-        )
+        target = tl.load(from_a + row * size_a + i, mask=inside, other=-1)
+        own = inside & (target >= 0)
+        weight = 2.0 * tl.load(grad_from_a + row * size_a + i, mask=own, other=0.0)
+        to = b + target * 3
+        gx = weight * (tl.load(a + i * 3, mask=own, other=0.0) - tl.load(to, mask=own, other=0.0))
+        gy = weight * (tl.load(a + i * 3 + 1, mask=own, other=0.0) - tl.load(to + 1, mask=own, other=0.0))
+        gz = weight * (tl.load(a + i * 3 + 2, mask=own, other=0.0) - tl.load(to + 2, mask=own, other=0.0))
     if OTHERS:
         sum_x = tl.zeros((QUERIES, CANDIDATES), a.dtype.element_ty)
         sum_y = tl.zeros((QUERIES, CANDIDATES), a.dtype.element_ty)
