@@ -63,7 +63,7 @@ def test_approxmatch(dtype):
         cost = dp.approxmatch(a, b, a_lengths=lengths[0], b_lengths=lengths[1])
         with torch.no_grad():
             alone = dp.approxmatch(a, b, a_lengths=lengths[0], b_lengths=lengths[1])
-        return [cost, alone, *torch.autograd.grad(cost @ torch.tensor([1.0, 2, 3], dtype=dtype), (a, b))]
+        return [cost, alone, *torch.autograd.grad(cost @ torch.tensor([1.0, 2, 3]).to(cost), (a, b))]
 
     assert_same(outputs, a, b, *lengths)
 

@@ -168,7 +168,7 @@ def test_enough_ends_the_auction_once_the_bound_reaches_it(started):
     a, b = random(3, 5, 3, seed=3, dtype=torch.float64), random(3, 7, 3, seed=4, dtype=torch.float64)
     start = dp.earth_mover_distance(a, b) if started else None
     usual = dp.earth_mover_distance(a[2:], b[2:], start=start and dp.Transport(*(x[2:] for x in start)))
-    exact = torch.tensor([optimum(x, y) for x, y in zip(a, b, strict=True)]).to(a)
+    exact = torch.tensor([optimum(x, y) for x, y in zip(a, b, strict=True)], dtype=a.dtype, device=DEVICE)
     # Far below the optimum, a little below, and above.
     enough = exact * torch.tensor([0.2, 0.9, 1.1]).to(a)
     result = dp.earth_mover_distance(a, b, start=start, enough=enough)
@@ -228,30 +228,29 @@ def test_the_operator_passes_opcheck():
     torch.library.opcheck(torch.ops.diffpoint.earth_mover_distance.default, tuple(moved))
 
 
-POINTS = torch.rand(2, 6, 3)
-BAD = POINTS.index_fill(1, torch.tensor([3]), torch.nan)
-INFINITE = POINTS.index_fill(1, torch.tensor([3]), torch.inf)
-WIDE = POINTS.index_fill(1, torch.tensor([3]), 3e19)
+POINTS = random(2, 6, 3, seed=6)
+THIRD = torch.tensor([3], device=DEVICE)
+BAD, INFINITE, WIDE = (POINTS.index_fill(1, THIRD, value) for value in (torch.nan, torch.inf, 3e19))
 BAD_CALLS = {
     "a": (lambda: dp.earth_mover_distance(BAD, POINTS), "'a' must be finite; got nan at index (0, 3, 0)"),
     "b": (lambda: dp.earth_mover_distance(POINTS, INFINITE), "'b' must be finite; got inf at index (0, 3, 0)"),
     "too many": (
-        lambda: dp.earth_mover_distance(POINTS, POINTS, a_lengths=torch.tensor([6, 7])),
+        lambda: dp.earth_mover_distance(POINTS, POINTS, a_lengths=torch.tensor([6, 7], device=DEVICE)),
         "'a_lengths' must lie in [1, 6]; got 7 at flat index 1",
     ),
     "none": (
-        lambda: dp.earth_mover_distance(POINTS, POINTS, b_lengths=torch.tensor([-2, 0])),
+        lambda: dp.earth_mover_distance(POINTS, POINTS, b_lengths=torch.tensor([-2, 0], device=DEVICE)),
         "'b_lengths' must lie in [1, 6]; got -2 at flat index 0",
     ),
     "empty": (lambda: dp.earth_mover_distance(POINTS, POINTS[:, :0]), "'b' must hold at least one point"),
     "extent": (lambda: dp.earth_mover_distance(WIDE, POINTS), "'a' must span less than 1e18 together with 'b'"),
-    "prices": (lambda: from_start(prices=torch.full((2, 6), torch.nan)), "'start.prices' must be finite"),
-    "cost": (lambda: from_start(cost=torch.full((2,), torch.inf)), "'start.cost' must be finite"),
+    "prices": (lambda: from_start(prices=POINTS[..., 0] / 0), "'start.prices' must be finite"),
+    "cost": (lambda: from_start(cost=POINTS[:, 0, 0] / 0), "'start.cost' must be finite"),
 }  # fmt: skip
 
 
 def from_start(**changes: torch.Tensor) -> dp.Transport:
-    start = on_cpu(dp.earth_mover_distance, POINTS, POINTS.flip(2))
+    start = dp.Transport(*(x.to(DEVICE) for x in on_cpu(dp.earth_mover_distance, POINTS, POINTS.flip(2))))
     return dp.earth_mover_distance(POINTS, POINTS.flip(2), start=start._replace(**changes))
 
 
