@@ -193,6 +193,8 @@ def check_transport(
     check_sets(name, a, b, a_lengths, b_lengths, smallest=1)
     for argument, values in (("start.prices", prices), ("start.cost", known_cost)):
         check_finite(name, argument, values)
+    if not len(a):
+        return a.new_empty(0)
     extent = _extent(a.detach(), a_lengths, b.detach(), b_lengths)
     if not bool((extent < _auction.LARGEST_EXTENT).all()):
         raise fail(

@@ -281,6 +281,12 @@ def test_emd_of_a_permuted_copy_is_zero_and_finds_the_permutation():
     assert torch.equal(result.assignment[0], order)
 
 
+@pytest.mark.parametrize("size", [0, 4])
+def test_emd_of_no_pairs_is_empty(size):
+    result = dp.earth_mover_distance(torch.rand(0, size, 3), torch.rand(0, size, 3))
+    assert [tuple(x.shape) for x in result] == [(0,), (0, size), (0,), (0,), (0, size)]
+
+
 def test_emd_of_a_small_shift_is_its_length():
     lattice = torch.cartesian_prod(*(torch.arange(6.0),) * 3)
     result = dp.earth_mover_distance(lattice, lattice + torch.tensor([0.0, 0.2, 0.0]), tolerance=1e-4)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 import diffpoint as dp
 from diffpoint import reference
-from diffpoint.transport import RESOLUTION
+from diffpoint._auction import RESOLUTION
 from properties import strategies
 from properties.compare import (
     AGREED,
@@ -163,7 +163,7 @@ def check_earth_mover_distance(recipes: tuple[strategies.Recipe, strategies.Reci
         assert -slack <= excess <= float(bound[i]) + slack
         # The resolution of the dtype also counts as converged: for a cost of 0 no tolerance of 2 % can be reached.
         both = torch.cat((p, q))
-        resolved = 10 * RESOLUTION[p.dtype] * float((both.amax(0) - both.amin(0)).norm())
+        resolved = 10 * RESOLUTION[p.dtype.itemsize] * float((both.amax(0) - both.amin(0)).norm())
         assert not converged[i] or bound[i] <= max(0.02 * cost[i], resolved) + slack
     return AGREED
 
