@@ -62,15 +62,14 @@ def knn(
     """
     a3, b3, la, lb, _ = paired_sets("knn", a, b, a_lengths, b_lengths)
     k = _checks.check_integer("knn", "k", k, "be a positive integer", 1)
-    if radius is None:
-        radius = torch.inf
-    else:
-        radius = _checks.check_number("knn", "radius", radius, "be a number of at least 0", lambda r: r >= 0)
+    reach = torch.inf
+    if radius is not None:
+        reach = _checks.check_number("knn", "radius", radius, "be a number of at least 0", lambda r: r >= 0)
     if exclude_self:
         _checks.check_shape(
             "knn", "b", b, tuple(a.shape), "With exclude_self=True, pass the points of 'a' again."
         )
-    squared_distance, index = _knn(a3, b3, la, lb, k, radius, exclude_self)
+    squared_distance, index = _knn(a3, b3, la, lb, k, reach, exclude_self)
     shape = (*a.shape[:-1], k)
     return Neighbours(squared_distance.reshape(shape), index.reshape(shape))
 

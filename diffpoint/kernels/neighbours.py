@@ -11,6 +11,7 @@ from diffpoint.kernels._backend import ti
 from diffpoint.kernels.blocks import BLOCK, GROUP, LANES, ROWS, box_tests
 
 NOBODY = 2**31 - 1  # the index of a neighbour that is not there; after those of all points
+NEVER = 2**63 - 1  # a key after those of all distances
 AROUND = 2  # boxes before and after the central one along the curve that are searched first
 
 
@@ -178,10 +179,10 @@ def build(real):
                                                 origin = ti.Vector([source for s in ti.static(range(LANES))])
                                                 stored_origin = origin
                                                 for s in ti.static(range(LANES)):
-                                                    other = ti.select(
-                                                        source == excluded[s], real(ti.math.inf), d[s]
+                                                    candidate_key = key_of(d[s], source)
+                                                    key[s] = ti.select(
+                                                        source == excluded[s], ti.i64(NEVER), candidate_key
                                                     )
-                                                    key[s] = key_of(other, source)
                                                 for q in range(k):
                                                     kept = keys[worker, q]
                                                     if ti.static(packed):
