@@ -93,7 +93,7 @@ def _front_sets(
         counts = _Counts(False, 0, 0)
     elif _checks.readable(points, depth, lengths):
         numbers = fallback.any().long(), *observed_lengths.aminmax()
-        some_fallback, fewest, most = torch.stack(numbers).tolist()
+        some_fallback, fewest, most = torch.stack(numbers).cpu().tolist()
         counts = _Counts(bool(some_fallback), fewest, most)
     if counts is None or counts.fallback:
         extra = points.shape[1] - seen.shape[2]

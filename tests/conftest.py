@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from train.data.batches import LoadedSplit
 
 
+# Run by tests in processes of their own, or in need of triton; doctest would import them here.
+collect_ignore = ["second_device.py", "compile_cuda_kernels.py", "cuda_launches.py"]
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--cuda-kernels",

@@ -76,7 +76,7 @@ class Checks:
         """
         waiting, self._open = self._open, []
         if waiting:
-            held = torch.stack([holds for holds, _ in waiting]).tolist()  # one copy from the GPU
+            held = torch.stack([holds for holds, _ in waiting]).cpu().tolist()  # one copy from the GPU
             for (_, complaint), it_held in zip(waiting, held, strict=True):
                 if not it_held:
                     raise UserError(complaint)
