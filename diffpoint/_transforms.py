@@ -71,7 +71,7 @@ def _differentiable(op: Any, name: str, backward: Callable | None, setup: Callab
     )
 
     # That of `Function` itself stands for all levels at once, and would not be called within one.
-    apply = super(torch.autograd.Function, function).apply
+    apply = super(torch.autograd.Function, function).apply  # pyright: ignore[reportAttributeAccessIssue]
 
     def kernel(keyset: Any, *arguments: Any) -> Any:
         if torch._C._are_functorch_transforms_active():
