@@ -34,7 +34,7 @@ class FrontSets(NamedTuple):
     predicted_lengths: Tensor
     """(B, V) int64."""
     observed: Tensor
-    """(B, V, K, 3) world frame: the points of the true depth map, then padding."""
+    """(B, V, P, 3) world frame: the points of the true depth map, then padding."""
     observed_lengths: Tensor
     """(B, V) int64; 0 for an empty depth map."""
     fallback: Tensor
