@@ -11,6 +11,7 @@ from diffpoint import _checks
 from diffpoint.cuda import errors
 from diffpoint.cuda.launch import launch
 from diffpoint.cuda.splat import image_position
+from diffpoint.cuda.values import count_not_finite
 
 _BLOCK = 256  # points or pixels of a program
 _SUMMED = 512  # of a step of the programs that sum over a whole view
@@ -61,9 +62,7 @@ def _project(points, projection, pixels, depth, not_finite, views, count, BLOCK:
     x = tl.load(source, mask=inside, other=0.0)
     y = tl.load(source + 1, mask=inside, other=0.0)
     z = tl.load(source + 2, mask=inside, other=0.0)
-    bad = tl.sum(((x - x != 0.0) | (y - y != 0.0) | (z - z != 0.0)).to(tl.int32), axis=0)
-    if bad > 0:
-        tl.atomic_add(not_finite, bad)
+    count_not_finite(x, y, z, not_finite)
     u, v, d = image_position(projection + view * 12, x, y, z)
     target = view * count + i
     tl.store(pixels + 2 * target, tl.where(d > 0.0, u, float("inf")), mask=inside)
@@ -244,9 +243,7 @@ def _reproject(
     full = d < infinite
     u, v = _pixel(p, width, depth.dtype.element_ty)
     x, y, z = _world_point(back_projection + view * 12, u, v, tl.where(full, d, 0.0), full)
-    bad = tl.sum(((x - x != 0.0) | (y - y != 0.0) | (z - z != 0.0)).to(tl.int32), axis=0)
-    if bad > 0:
-        tl.atomic_add(not_finite, bad)
+    count_not_finite(x, y, z, not_finite)
     m = projection + view * 12
     w = _row_times(m, 2, x, y, z)
     before = full & (w > 0.0)

@@ -12,6 +12,7 @@ from torch import Tensor
 from diffpoint import _checks
 from diffpoint.cuda import errors
 from diffpoint.cuda.launch import bits_of, launch, real
+from diffpoint.cuda.values import count_not_finite
 
 _POINTS, _PIXELS = 128, 256  # of a program
 _NOBODY = tl.constexpr(2**62)  # the index of an empty pixel, until it is decoded
@@ -51,9 +52,7 @@ def _offer(
     y = tl.load(at + 1, mask=inside, other=0.0)
     z = tl.load(at + 2, mask=inside, other=0.0)
     if not SECOND:
-        bad = tl.sum(((x - x != 0.0) | (y - y != 0.0) | (z - z != 0.0)).to(tl.int32), axis=0)
-        if bad > 0:
-            tl.atomic_add(not_finite, bad)
+        count_not_finite(x, y, z, not_finite)
         if tl.program_id(0) % tiles == 0 and (length < 0 or length > count):
             tl.atomic_add(not_in_range, 1)
     u, v, d = image_position(projection + view * 12, x, y, z)

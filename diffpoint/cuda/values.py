@@ -14,6 +14,14 @@ _BLOCK = 1024
 
 
 @triton.jit
+def count_not_finite(x, y, z, counter):
+    """Adds to a counter the number of points that are NaN or infinite."""
+    bad = tl.sum(((x - x != 0.0) | (y - y != 0.0) | (z - z != 0.0)).to(tl.int32), axis=0)
+    if bad > 0:
+        tl.atomic_add(counter, bad)
+
+
+@triton.jit
 def _count_bad(points, lengths, not_finite, not_in_range, size, smallest, BLOCK: tl.constexpr):
     blocks = tl.cdiv(size * 3, BLOCK)
     row = (tl.program_id(0) // blocks).to(tl.int64)

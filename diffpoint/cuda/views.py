@@ -10,6 +10,7 @@ from torch import Tensor
 from diffpoint import _checks
 from diffpoint.cuda import errors
 from diffpoint.cuda.launch import launch
+from diffpoint.cuda.values import count_not_finite
 
 _POINTS = 256  # of a program
 
@@ -30,9 +31,7 @@ def _gather(points, visible, order, sampled, index, not_finite, views, count, la
     tl.store(sampled + target * 3 + 1, y, mask=seen)
     tl.store(sampled + target * 3 + 2, z, mask=seen)
     tl.store(index + target, i.to(tl.int64), mask=seen)
-    bad = tl.sum(((x - x != 0.0) | (y - y != 0.0) | (z - z != 0.0)).to(tl.int32), axis=0)
-    if bad > 0:
-        tl.atomic_add(not_finite, bad)
+    count_not_finite(x, y, z, not_finite)
 
 
 @triton.jit
