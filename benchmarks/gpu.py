@@ -7,8 +7,6 @@ named and left out. It writes `gpu-<name>.json` and `.md` after each part, so th
 from __future__ import annotations
 
 import json
-import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -39,8 +37,7 @@ def main(out: Path, *, minutes: float) -> int:
         print(f"gpu: skipped: {built if torch.version.cuda else f'torch {torch.__version__}'} {missing}")
         return 0
     end = time.monotonic() + 60 * minutes
-    name = torch.cuda.get_device_name()
-    path = out / ("gpu-" + "".join(ch if ch.isalnum() else "-" for ch in name).lower() + ".json")
+    path = out / f"gpu-{saved.file_stem(torch.cuda.get_device_name())}.json"
     results: dict[str, Any] = {"machine": _machine()}
     failed = False
     for part, measure in (("ops", _ops), ("steps", _steps), ("tests", _tests), ("training", _training)):
@@ -68,13 +65,10 @@ def main(out: Path, *, minutes: float) -> int:
 def _machine() -> dict[str, Any]:
     major, minor = torch.cuda.get_device_capability()
     triton = optional("triton")
-    return {
+    return saved.machine() | {
         "gpu": torch.cuda.get_device_name(),
         "capability": f"{major}.{minor}",
         "memory_gib": round(torch.cuda.get_device_properties(0).total_memory / 2**30, 1),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
         "triton": triton.__version__ if triton else None,
     }
 
@@ -181,29 +175,22 @@ def _races(
             return _apart(splat(), splat(cloud.cpu(), camera.to("cpu")))
 
         yield f"splat, {side} x {side}", f"{clouds} x {points}", mark, splat, [], compare
-    for side in (56,):  # also the map's side in training
-        camera = circle_of_cameras(clouds, side).to(device)
-        depth = dp.splat_depth(surfaces(clouds, 2 * points, seed=2).to(device), camera, radius=1.0).depth
-        for distance, mark in (("chamfer", None), ("emd", None)):
+    camera = circle_of_cameras(clouds, 56).to(device)  # of the size of the maps in training
+    depth = dp.splat_depth(surfaces(clouds, 2 * points, seed=2).to(device), camera, radius=1.0).depth
+    for distance in ("chamfer", "emd"):
 
-            def front(
-                cloud: Tensor = cloud, camera: Any = camera, depth: Tensor = depth, distance: Any = distance
-            ):
-                cloud = cloud.detach().requires_grad_()
-                loss = dp.front_terms(cloud, camera, depth, distance=distance).loss.sum()
-                return torch.autograd.grad(loss, cloud)[0]
+        def front(
+            cloud: Tensor = cloud, camera: Any = camera, depth: Tensor = depth, distance: Any = distance
+        ) -> Tensor:
+            cloud = cloud.detach().requires_grad_()
+            loss = dp.front_terms(cloud, camera, depth, distance=distance).loss.sum()
+            return torch.autograd.grad(loss, cloud)[0]
 
-            def compare_front(front: Callable = front, camera: Any = camera, depth: Tensor = depth) -> str:
-                return _apart(front(), front(cloud.cpu(), camera.to("cpu"), depth.cpu()))
+        def compare_front(front: Callable = front, camera: Any = camera, depth: Tensor = depth) -> str:
+            return _apart(front(), front(cloud.cpu(), camera.to("cpu"), depth.cpu()))
 
-            yield (
-                f"front constraint by {distance}, with gradient",
-                f"{clouds} x {points}",
-                mark,
-                front,
-                [],
-                compare_front,
-            )
+        name = f"front constraint by {distance}, with gradient"
+        yield name, f"{clouds} x {points}", None, front, [], compare_front
 
     def farthest(cloud: Tensor = cloud) -> Tensor:
         return dp.farthest_point_sample(cloud, points // 4)

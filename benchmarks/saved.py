@@ -33,8 +33,18 @@ def title(here: dict[str, Any]) -> str:
 
 def path_for(folder: Path, here: dict[str, Any]) -> Path:
     """The results of this machine, named by its processor and cores."""
-    name = "".join(ch if ch.isalnum() else "-" for ch in f"{here['processor']} {here['cores']} cores").lower()
-    return folder / f"{name}.json"
+    stem = file_stem(f"{here['processor']} {here['cores']} cores")
+    return folder / f"{stem}.json"
+
+
+def file_stem(name: str) -> str:
+    """A name as that of a file.
+
+    Example:
+        >>> file_stem("AMD EPYC 2 cores")
+        'amd-epyc-2-cores'
+    """
+    return "".join(ch if ch.isalnum() else "-" for ch in name).lower()
 
 
 def load(folder: Path, here: dict[str, Any]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
+from diffpoint._common import share_within
 from diffpoint.blocks import Blocks, sort_into_blocks
 
 # Number of pairs from which the search with boxes is faster than trying all pairs, for any clouds.
@@ -210,7 +211,8 @@ def _nearest_fake(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor):
     return a.new_empty(a.shape[:2]), a.new_empty(a.shape[:2], dtype=torch.int64)
 
 
-def _nearest_setup(ctx, inputs, output) -> None:
+def nearest_setup(ctx, inputs, output) -> None:
+    """Keeps two sets and the index of neighbours for the gradient of the squared distances."""
     a, b, *_ = inputs
     ctx.mark_non_differentiable(output[1])
     ctx.set_materialize_grads(False)
@@ -224,7 +226,7 @@ def _nearest_gradient(ctx, grad_squared_distance: Tensor | None, _grad_index):
     return *_nearest_backward(a, b, index, grad_squared_distance), None, None
 
 
-@_bridge.register("nearest", fake=_nearest_fake, backward=_nearest_gradient, setup=_nearest_setup)
+@_bridge.register("nearest", fake=_nearest_fake, backward=_nearest_gradient, setup=nearest_setup)
 def _nearest(a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor) -> tuple[Tensor, Tensor]:
     _checks.check_sets("nearest", a, b, a_lengths, b_lengths, smallest=0)
     if _is_large(a, b):
@@ -297,12 +299,7 @@ def _shares_within(
     """Share of the points of `a` with a point of `b` at a distance of at most `threshold`, and the other way round."""
     _checks.check_sets("f_score", a, b, a_lengths, b_lengths, smallest=1)
     from_a, _, from_b, _ = _search_both(a, b, a_lengths, b_lengths)
-    shares = []
-    for squared_distance, lengths in ((from_a, a_lengths), (from_b, b_lengths)):
-        counts = torch.arange(squared_distance.shape[1]) < lengths[:, None]
-        within = (squared_distance.sqrt() <= threshold) & counts
-        shares.append(within.sum(-1).to(a.dtype) / lengths)
-    return shares[0], shares[1]
+    return share_within(from_a, a_lengths, threshold), share_within(from_b, b_lengths, threshold)
 
 
 def _search_both(

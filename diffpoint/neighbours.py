@@ -9,7 +9,7 @@ from torch import Tensor
 
 from diffpoint import _bridge, _checks
 from diffpoint.blocks import LANES, sort_into_blocks
-from diffpoint.distances import add_nearest_gradients, paired_sets
+from diffpoint.distances import add_nearest_gradients, nearest_setup, paired_sets
 
 _WORKERS = 256  # runs of queries, more than any number of threads; each has its own place for what it finds
 _LARGE_K = 256  # above this, sorting every row of distances is faster
@@ -81,13 +81,6 @@ def _knn_fake(
     return a.new_empty(shape), a.new_empty(shape, dtype=torch.int64)
 
 
-def _knn_setup(ctx, inputs, output) -> None:
-    a, b, *_ = inputs
-    ctx.mark_non_differentiable(output[1])
-    ctx.set_materialize_grads(False)
-    ctx.save_for_backward(a, b, output[1])
-
-
 def _knn_gradient(ctx, grad_squared_distance: Tensor | None, _grad_index):
     if grad_squared_distance is None:
         return (None,) * 7
@@ -95,7 +88,7 @@ def _knn_gradient(ctx, grad_squared_distance: Tensor | None, _grad_index):
     return *_knn_backward(a, b, index, grad_squared_distance), None, None, None, None, None
 
 
-@_bridge.register("knn", fake=_knn_fake, backward=_knn_gradient, setup=_knn_setup)
+@_bridge.register("knn", fake=_knn_fake, backward=_knn_gradient, setup=nearest_setup)
 def _knn(
     a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, k: int, radius: float, exclude_self: bool
 ) -> tuple[Tensor, Tensor]:

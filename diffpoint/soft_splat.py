@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
-from diffpoint._footprint import least_fade
+from diffpoint._common import least_fade
 from diffpoint.camera import PinholeCamera
 from diffpoint.reproject import project
 

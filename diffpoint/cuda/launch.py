@@ -9,8 +9,8 @@ import torch
 import triton
 import triton.language as tl
 
-recorded: list[tuple[Any, tuple, int]] | None = None
-"""If a list, it receives every launch: kernel, arguments, warps. For the test that compiles them without a GPU."""
+recorded: list[tuple[Any, tuple, dict[str, Any]]] | None = None
+"""If a list, it receives every launch: kernel, arguments, options. For the test that compiles them without a GPU."""
 
 
 def launch(kernel: Any, programs: int, *arguments: Any, warps: int = 4, registers: int | None = None) -> None:

@@ -8,6 +8,7 @@ import triton.language as tl
 from torch import Tensor
 
 from diffpoint import _checks
+from diffpoint._common import share_within
 from diffpoint.cuda import errors
 from diffpoint.cuda.launch import launch
 from diffpoint.cuda.values import count_bad_sets
@@ -137,13 +138,8 @@ def shares_within(
     """As the operator."""
     from_a, _ = _nearest(a, b, a_lengths, b_lengths)
     from_b, _ = _nearest(b, a, b_lengths, a_lengths)
-    shares = []
-    for squared_distance, lengths in ((from_a, a_lengths), (from_b, b_lengths)):
-        counts = torch.arange(squared_distance.shape[1], device=a.device) < lengths[:, None]
-        within = (squared_distance.sqrt() <= threshold) & counts
-        shares.append(within.sum(-1).to(a.dtype) / lengths)
     _check("f_score", a, b, a_lengths, b_lengths, smallest=1)
-    return shares[0], shares[1]
+    return share_within(from_a, a_lengths, threshold), share_within(from_b, b_lengths, threshold)
 
 
 def nearest_backward(

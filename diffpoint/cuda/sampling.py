@@ -16,13 +16,14 @@ _TILE = 4096  # points at once where they do not
 
 
 @triton.jit
-def _limits(lengths, counts, starts, not_in_range, too_many, cloud, size, allow_fewer):
-    """Length, number of points to choose and first point of a cloud, within what it has; counts what is not."""
+def _limits(lengths, counts, starts, too_many, cloud, size, allow_fewer):
+    """Length, number of points to choose and first point of a cloud, within what it has.
+
+    Counts numbers and first points that are not; `count_bad_points` has counted the lengths.
+    """
     length = tl.load(lengths + cloud)
     count = tl.load(counts + cloud)
     start = tl.load(starts + cloud)
-    if length < 0 or length > size:
-        tl.atomic_add(not_in_range, 1)
     if count < 0 or (count > length and allow_fewer == 0) or start < 0 or start > tl.maximum(length - 1, 0):
         tl.atomic_add(too_many, 1)
     length = tl.maximum(tl.minimum(length, size), 0)
@@ -37,7 +38,6 @@ def _farthest(
     counts,
     starts,
     chosen,
-    not_in_range,
     too_many,
     size,
     width,
@@ -45,9 +45,7 @@ def _farthest(
     BLOCK: tl.constexpr,
 ):
     cloud = tl.program_id(0).to(tl.int64)
-    length, count, current = _limits(
-        lengths, counts, starts, not_in_range, too_many, cloud, size, allow_fewer
-    )
+    length, count, current = _limits(lengths, counts, starts, too_many, cloud, size, allow_fewer)
     points += cloud * size * 3
     i = tl.arange(0, BLOCK)
     inside = i < length
@@ -67,14 +65,12 @@ def _farthest(
 
 @triton.jit
 def _farthest_of_many(
-    points, lengths, counts, starts, distance, chosen, not_in_range, too_many, size, width, allow_fewer,
+    points, lengths, counts, starts, distance, chosen, too_many, size, width, allow_fewer,
     TILE: tl.constexpr,
 ):  # fmt: skip
     """As `_farthest`, with the distances in memory. Lanes keep the best of their own points until the end of a pass."""
     cloud = tl.program_id(0).to(tl.int64)
-    length, count, current = _limits(
-        lengths, counts, starts, not_in_range, too_many, cloud, size, allow_fewer
-    )
+    length, count, current = _limits(lengths, counts, starts, too_many, cloud, size, allow_fewer)
     points += cloud * size * 3
     distance += cloud * size
     dtype: tl.constexpr = points.dtype.element_ty
@@ -114,18 +110,16 @@ def farthest_point_sample(
     chosen = lengths.new_full((batch, width), -1)
     if batch:
         count_bad_points(function, "points", points, lengths)
-        counters = [
-            errors.counter(points, function, *kind) for kind in (("lengths", "length"), ("k", "picks"))
-        ]
+        too_many = errors.counter(points, function, "k", "picks")
         inputs = points, lengths, counts, starts
         sizes = size, width, int(allow_fewer)
         if size <= _REGISTERS:
             block = max(64, triton.next_power_of_2(size))
             warps = 4 if block <= 1024 else 8 if block <= 2048 else 16
-            launch(_farthest, batch, *inputs, chosen, *counters, *sizes, block, warps=warps)
+            launch(_farthest, batch, *inputs, chosen, too_many, *sizes, block, warps=warps)
         else:
             distance = points.new_empty((batch, size))
-            launch(_farthest_of_many, batch, *inputs, distance, chosen, *counters, *sizes, _TILE, warps=16)
+            launch(_farthest_of_many, batch, *inputs, distance, chosen, too_many, *sizes, _TILE, warps=16)
 
     def name_it() -> None:
         _checks.check_picks(lengths, size, counts, starts, allow_fewer=allow_fewer)

@@ -10,7 +10,7 @@ import triton.language as tl
 from torch import Tensor
 
 from diffpoint import _checks
-from diffpoint._footprint import least_fade
+from diffpoint._common import least_fade
 from diffpoint.cuda import errors
 from diffpoint.cuda.launch import bits_of, launch, real
 
@@ -185,16 +185,17 @@ def soft_splat_backward(
 ) -> tuple[Tensor, Tensor]:
     """As the operator."""
     batch, views, count = point_depth.shape
-    grad_pixels, grad_point_depth = torch.zeros_like(pixels), torch.zeros_like(point_depth)
-    if point_depth.numel() and depth.numel():
-        inputs = pixels, point_depth, lengths, depth, nearest, weight, grad_depth, grad_coverage
-        numbers = (
-            bits_of(radius),
-            bits_of(softness),
-            bits_of(least_fade(depth, radius)),
-            math.floor(radius + 0.5),
-        )
-        sizes = views, count, *depth.shape[2:], *numbers
-        programs = batch * views * triton.cdiv(count, _POINTS)
-        launch(_to_points, programs, *inputs, grad_pixels, grad_point_depth, *sizes, _POINTS)
+    if not (point_depth.numel() and depth.numel()):
+        return torch.zeros_like(pixels), torch.zeros_like(point_depth)
+    grad_pixels, grad_point_depth = torch.empty_like(pixels), torch.empty_like(point_depth)
+    inputs = pixels, point_depth, lengths, depth, nearest, weight, grad_depth, grad_coverage
+    numbers = (
+        bits_of(radius),
+        bits_of(softness),
+        bits_of(least_fade(depth, radius)),
+        math.floor(radius + 0.5),
+    )
+    sizes = views, count, *depth.shape[2:], *numbers
+    programs = batch * views * triton.cdiv(count, _POINTS)
+    launch(_to_points, programs, *inputs, grad_pixels, grad_point_depth, *sizes, _POINTS)
     return grad_pixels, grad_point_depth

@@ -15,6 +15,7 @@ from diffpoint.cuda.launch import bits_of, launch, real
 from diffpoint.cuda.values import count_not_finite
 
 _POINTS, _PIXELS = 128, 256  # of a program
+_SUMMED = 1024  # pixels at once in the program that sums over a view
 _NOBODY = tl.constexpr(2**62)  # the index of an empty pixel, until it is decoded
 _EMPTY = tl.constexpr(0x7F800000_FFFFFFFF)  # the key of an empty pixel: the bits of +inf, then those of -1
 
@@ -27,6 +28,16 @@ def image_position(camera, x, y, z):
     u = tl.load(camera) * x + tl.load(camera + 1) * y + tl.load(camera + 2) * z + tl.load(camera + 3)
     v = tl.load(camera + 4) * x + tl.load(camera + 5) * y + tl.load(camera + 6) * z + tl.load(camera + 7)
     return u * inverse, v * inverse, d
+
+
+@triton.jit
+def _own_pixel(u, v, d, inside, height, width, reach):
+    """Whether points may cover a pixel, at most `reach` from their own; and the column and row of their own."""
+    near = inside & (d > 0.0) & (u >= -reach - 1.0) & (u < width + reach + 1.0)
+    near = near & (v >= -reach - 1.0) & (v < height + reach + 1.0)
+    column = tl.floor(tl.where(near, u, 0.0)).to(tl.int32)
+    row = tl.floor(tl.where(near, v, 0.0)).to(tl.int32)
+    return near, column, row
 
 
 @triton.jit
@@ -56,17 +67,8 @@ def _offer(
         if tl.program_id(0) % tiles == 0 and (length < 0 or length > count):
             tl.atomic_add(not_in_range, 1)
     u, v, d = image_position(projection + view * 12, x, y, z)
-    rows = height.to(dtype)
-    columns = width.to(dtype)
-    margin = 0.0
-    radius = 0.0
-    if DISC:
-        radius = real(radius_bits, dtype)
-        margin = radius + 1.0
-    near = (d > 0.0) & (u >= -margin) & (u < columns + margin) & (v >= -margin) & (v < rows + margin)
-    near = near & inside
-    column = tl.floor(tl.where(near, u, 0.0)).to(tl.int32)
-    row = tl.floor(tl.where(near, v, 0.0)).to(tl.int32)
+    near, column, row = _own_pixel(u, v, d, inside, height, width, reach)
+    radius = real(radius_bits, dtype)
     if PACKED:
         key = (d.to(tl.int32, bitcast=True).to(tl.int64) << 32) | i.to(tl.int64)
     else:
@@ -140,10 +142,7 @@ def _to_points(
         view = cloud * views + of_cloud
         camera = projection + view * 12
         u, v, d = image_position(camera, x, y, z)
-        near = (d > 0.0) & (u >= -reach - 1.0) & (u < width + reach + 1.0)
-        near = near & (v >= -reach - 1.0) & (v < height + reach + 1.0) & (i < count)
-        column = tl.floor(tl.where(near, u, 0.0)).to(tl.int32)
-        row = tl.floor(tl.where(near, v, 0.0)).to(tl.int32)
+        near, column, row = _own_pixel(u, v, d, i < count, height, width, reach)
         total = tl.zeros((POINTS,), dtype)
         for down in range(-reach, reach + 1):
             for across in range(-reach, reach + 1):
@@ -244,7 +243,7 @@ def splat_backward(
     sizes = views, count, height, width, _reach(radius)
     launch(_to_points, batch * triton.cdiv(count, _POINTS), *inputs, *sizes, _POINTS)
     inputs = points, index, grad_depth, grad_projection
-    launch(_to_camera, batch * views, *inputs, views, count, height * width, 1024)
+    launch(_to_camera, batch * views, *inputs, views, count, height * width, _SUMMED)
     return grad_points, grad_projection
 
 

@@ -82,11 +82,12 @@ def sample_view(points: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor
 def sample_view_backward(index: Tensor, grad_sampled: Tensor, count: int) -> Tensor:
     """As the operator."""
     batch, views, largest = index.shape
-    grad_points = grad_sampled.new_zeros((batch, count, 3))
-    if index.numel():
-        slot = inverse(index, count)
-        programs = batch * triton.cdiv(count, _POINTS)
-        launch(_to_points, programs, slot, grad_sampled, grad_points, views, count, largest, _POINTS)
+    if not index.numel():
+        return grad_sampled.new_zeros((batch, count, 3))
+    grad_points = grad_sampled.new_empty((batch, count, 3))
+    programs = batch * triton.cdiv(count, _POINTS)
+    inputs = inverse(index, count), grad_sampled, grad_points
+    launch(_to_points, programs, *inputs, views, count, largest, _POINTS)
     return grad_points
 
 

@@ -256,9 +256,8 @@ class Trainer:
         step = Step(phase, self.step, timer, self.world, self.checks)
         try:
             terms = self.method.losses[self.phase_name](state, batch, noise, step)
-        except (
-            ValueError
-        ):  # the layer refuses numbers that are not finite, perhaps before an open check said so
+        except ValueError:
+            # The layer refuses numbers that are not finite, perhaps before an open check has said so.
             self.checks.settle()
             raise
         check_finite(terms["loss"], "the loss is", step)
