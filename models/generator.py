@@ -160,6 +160,11 @@ class Generator(Predictor):
         """(B, C, h, w) features and (R, B, code_dim) codes -> (R, B, N, 3) points, as `forward`."""
         return _existing(self._decode(features, codes))
 
+    @property
+    def output_layers(self) -> list[nn.Module]:
+        """The layers whose outputs are coordinates, or a latent code."""
+        return self.decoder.output_layers
+
     def dead_share(self, features: Tensor) -> float:
         """Share of the trunk's output channels that are zero at every place of every image."""
         return (features.amax((0, 2, 3)) <= 0).float().mean().item()

@@ -139,6 +139,10 @@ class LatentDecoder(_Contraction):
         super().__init__(config)
         self.latent = nn.Linear(self.fc_width, LATENT_DIM)
 
+    @property
+    def output_layers(self) -> list[nn.Module]:
+        return [self.latent]
+
     def forward(self, joined: Tensor) -> Tensor:
         vector = self.contract(joined)[-1]
         with precision(joined):  # bfloat16 would round coordinates to 1/500 of an object's size
@@ -162,6 +166,10 @@ class PointDecoder(_Contraction):
         self.up3, self.skip3 = _deconv(c128, c64), _conv(joined, c64)
         self.merge3 = _conv_relu(config, c64, (c64, 3, 1), (c64, 3, 1))
         self.conv_points = _conv(c64, config.points_per_cell * self.values)
+
+    @property
+    def output_layers(self) -> list[nn.Module]:
+        return [self.fc_points, self.conv_points]
 
     def forward(self, joined: Tensor) -> Tensor:
         x4, x5, bottleneck, vector = self.contract(joined)
@@ -202,7 +210,7 @@ def initialise(network: nn.Module) -> None:
     for part in network.modules():
         if isinstance(part, PointDecoder):
             summed |= {part.up5, part.skip5, part.up4, part.skip4, part.skip3}
-            final |= {part.fc_points, part.conv_points}
+            final |= {*part.output_layers}
     for module in network.modules():
         if not isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
             continue

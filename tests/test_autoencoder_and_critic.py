@@ -29,7 +29,8 @@ from train.data.batches import Batch, LoadedSplit
 from train.errors import UserError
 from train.evaluation.runs import best_weights, load_autoencoder, load_generator
 from train.methods import get_method, recipe
-from train.methods.base import Noise, Step, TrainState, adam
+from train.methods.base import Noise, Step, TrainState
+from train.methods.optimisers import adam
 from train.methods.ours import autoencoder_loss, critic_steps
 from train.methods.weights import save_weights
 from train.training.trainer import Trainer

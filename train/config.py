@@ -36,12 +36,12 @@ EXACT_MEAN_EMD_FROM_PAPER = 2048 * 1.3
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """How long a phase lasts, and Adam's step size in it."""
+    """How long a phase lasts, and the optimiser's step size in it."""
 
     steps: int
     """Optimiser steps."""
     learning_rate: float = 1e-4
-    """Adam's step size after the warm-up."""
+    """The optimiser's step size after the warm-up."""
     final_learning_rate: float = 1e-4
     """Step size at the phase's end, reached along a cosine."""
     warmup: int = 0
@@ -132,6 +132,8 @@ class StageConfig(Schedule):
     from every shape, and so never the nearest, is pulled towards them."""
     weight_decay: float = 0.0
     """Weight of |weights|^2 / 2 added to the loss; not used by the paper's own training."""
+    optimiser: Literal["adam", "muon"] = "adam"
+    """"adam", as in the paper; "muon": orthogonal steps for the matrices of the network, Adam for the rest."""
 
     @property
     def exact_alpha(self) -> float:

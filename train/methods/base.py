@@ -21,6 +21,7 @@ from train.data.batches import Targets
 from train.device import CPU
 from train.distributed import SINGLE, World
 from train.errors import UserError
+from train.methods.optimisers import adam
 from train.timer import Timer
 
 
@@ -190,6 +191,8 @@ class Method(ABC):
                 f"{name} does not support a critic, the latent output head, the deterministic counterpart or variants; "
                 "do not set --output-head, --deterministic, --variant or --stage*.gamma"
             )
+        if any(stage.optimiser != "adam" for stage in config.stages):
+            raise UserError(f"{name} is trained by Adam; do not set --stage*.optimiser")
         other_network = config.decoder_width != 1 or config.points_per_cell != 2 or config.group_norm
         if other_network or any(stage.shape_weight for stage in config.stages):
             raise UserError(
@@ -206,25 +209,13 @@ class Method(ABC):
         network = self.build(config).to(device)
         return TrainState(network, adam(network))
 
+    def optimiser(self, network: Predictor, phase: StageConfig) -> torch.optim.Optimizer:
+        """A new optimiser of the network, for a phase."""
+        return adam(network, weight_decay=phase.weight_decay)
+
     def begin_phase(self, state: TrainState, phase: str) -> None:
         """Prepares the networks for a phase, once the weights that it starts from are loaded."""
         return
-
-
-def adam(network: nn.Module, *, weight_decay: float = 0.0) -> torch.optim.Adam:
-    """Adam over the parameters that are not frozen; its step size is set at every step."""
-    return torch.optim.Adam(trainable(network), fused=True, weight_decay=weight_decay)
-
-
-def trainable(network: nn.Module) -> list[nn.Parameter]:
-    """The parameters that are not frozen."""
-    return [parameter for parameter in network.parameters() if parameter.requires_grad]
-
-
-def set_learning_rate(optimiser: torch.optim.Optimizer, learning_rate: float) -> None:
-    """Sets the step size of all of an optimiser's parameters."""
-    for group in optimiser.param_groups:
-        group["lr"] = learning_rate
 
 
 def check_finite(values: Tensor, what: str, step: Step) -> None:

@@ -36,9 +36,7 @@ from train.methods.base import (
     Noise,
     Step,
     TrainState,
-    adam,
     check_finite,
-    set_learning_rate,
 )
 from train.methods.losses import (
     diversity_term,
@@ -47,6 +45,7 @@ from train.methods.losses import (
     targets_of,
     view_loss,
 )
+from train.methods.optimisers import Muon, adam, set_learning_rate
 
 
 def generator_loss(state: TrainState, batch: Batch, noise: Noise, step: Step) -> dict[str, Tensor]:
@@ -213,6 +212,12 @@ class Ours(Method):
         generator = self.build(config).to(device)
         autoencoder, critic = build_autoencoder(config.profile).to(device), Critic().to(device)
         return TrainState(generator, adam(generator), autoencoder, critic, adam(critic))
+
+    def optimiser(self, network: Predictor, phase: StageConfig) -> torch.optim.Optimizer:
+        if phase.optimiser == "muon":
+            assert isinstance(network, Generator)
+            return Muon(network, output_layers=network.output_layers, weight_decay=phase.weight_decay)
+        return super().optimiser(network, phase)
 
     def begin_phase(self, state: TrainState, phase: str) -> None:
         """Before stage 1, gives a generator with the latent output head the decoder of the auto-encoder."""

@@ -33,7 +33,8 @@ from train.evaluation.runs import (
 )
 from train.files import as_paths, write_text
 from train.methods import get_method
-from train.methods.base import Checks, Noise, Step, adam, check_finite, set_learning_rate
+from train.methods.base import Checks, Noise, Step, check_finite
+from train.methods.optimisers import adam, set_learning_rate
 from train.methods.weights import save_weights
 from train.processes import StopRequest, progress_bar
 from train.timer import Timer
@@ -327,7 +328,7 @@ class Trainer:
         if isinstance(phase, StageConfig):
             if state.autoencoder is not None:
                 state.autoencoder.freeze()
-            state.optimiser = adam(state.network.train(), weight_decay=phase.weight_decay)
+            state.optimiser = self.method.optimiser(state.network.train(), phase)
         else:
             state.optimiser = adam(self.trained_network.train().requires_grad_(True))
 
