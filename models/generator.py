@@ -16,7 +16,7 @@ import dataclasses
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from models.autoencoder import Autoencoder, ShapeDecoder
 from models.parts import (

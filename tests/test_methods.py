@@ -110,6 +110,11 @@ def test_a_name_of_no_method_is_refused_with_the_names_of_all() -> None:
             {"points_per_cell": 4},
             "has a network and a loss of its own; do not set --decoder-width, --points",
         ),
+        (
+            "psgn",
+            {"stage1": dataclasses.replace(recipe("psgn", "smoke").stage1, optimiser="muon")},
+            r"is trained by Adam; do not set --stage\*.optimiser",
+        ),
         ("ptn", {"stage2": recipe("ptn", "smoke").stage1}, "has no stage2; leave its steps at 0"),
     ],
 )

@@ -295,6 +295,7 @@ def whole_shapes(config: FitConfig) -> FitConfig:
     """
     changes: dict[str, Any] = {
         "codes": 5, "front": "chamfer", "beta": 0.0, "gamma": 0.0, "shape_weight": 2.0, "shape_relaxation": 0.1,
+        "optimiser": "muon",
     }  # fmt: skip
     return dataclasses.replace(
         config,
