@@ -338,8 +338,8 @@ def inference(data: Path, run: Path) -> None:
         close(found, wanted, tolerance=1e-4)
     close(predict(there, images[0, 0], 3, seed=1), predict(here, images[0, 0], 3, seed=1))
     codes = torch.zeros(2, here.code_dim)
-    answers = [explore(model, images[0, :2], codes, progress=False) for model in (there, here)]
-    close(*([each._asdict() for each in of] for of in answers), tolerance=1e-4)
+    planes = [explore(model, images[0, :2], codes, progress=False) for model in (there, here)]
+    close(*([each._asdict() for each in of] for of in planes), tolerance=1e-4)
 
 
 @check

@@ -26,7 +26,7 @@ from train.evaluation.inference import reconstruct
 from train.evaluation.runs import load_generator, open_run
 from train.methods import get_method
 from train.methods.weights import save_weights
-from train.show.explorer import Answers, write_explorer
+from train.show.explorer import CodePlane, write_explorer
 
 
 class _Linear(Predictor):
@@ -50,8 +50,8 @@ class _Linear(Predictor):
         raise NotImplementedError
 
 
-def _answers_in(page: Path) -> list[dict[str, Any]]:
-    (found,) = re.findall(r'<script type="application/json" id="answers">(.*?)</script>', page.read_text())
+def _planes_in(page: Path) -> list[dict[str, Any]]:
+    (found,) = re.findall(r'<script type="application/json" id="planes">(.*?)</script>', page.read_text())
     return json.loads(found)
 
 
@@ -90,32 +90,32 @@ def test_the_plane_passes_through_the_given_codes(tmp_path: Path):
     codes = torch.randn(2, 16, generator=torch.Generator().manual_seed(3))
     codes[0] *= 0.3
     codes[1] += 6 * model.directions[0]  # further out than the plane usually reaches
-    answers = explore(model, images, codes, progress=False)
-    write_explorer(tmp_path / "page.html", answers)
-    for packed, each, code in zip(_answers_in(tmp_path / "page.html"), answers, codes, strict=True):
+    planes = explore(model, images, codes, progress=False)
+    write_explorer(tmp_path / "page.html", planes)
+    for packed, each, code in zip(_planes_in(tmp_path / "page.html"), planes, codes, strict=True):
         assert np.abs(packed["start"]).max() < 1
         expected = model(images[:1], code[None, None])[0, 0].numpy()
         # Blending is exact for clouds that are linear in the code; what is left are the basis' 8 bits.
         assert _rms(_blended(packed, *packed["start"]), expected) < 0.004
         true_spread = torch.einsum("knc,knc->n", model.changes, model.changes).sqrt()
         torch.testing.assert_close(each.spread, true_spread, rtol=0.3, atol=0)
-    assert answers[0].reach == 2.5
-    assert answers[1].reach > 4
+    assert planes[0].reach == 2.5
+    assert planes[1].reach > 4
 
 
 def test_at_the_grids_codes_the_page_holds_the_predictions(smoke_run: Path, picture: Path, tmp_path: Path):
     model, images = load_generator(smoke_run), read_images([picture])
     codes = torch.randn(1, model.code_dim, generator=torch.Generator().manual_seed(0))
-    (answers,) = explore(model, images, codes, progress=False)
-    write_explorer(tmp_path / "page.html", [answers])
-    (packed,) = _answers_in(tmp_path / "page.html")
-    side = round(len(answers.clouds) ** 0.5)
+    (plane,) = explore(model, images, codes, progress=False)
+    write_explorer(tmp_path / "page.html", [plane])
+    (packed,) = _planes_in(tmp_path / "page.html")
+    side = round(len(plane.clouds) ** 0.5)
     errors = [
         _rms(_blended(packed, 2 * column / (side - 1) - 1, 2 * row / (side - 1) - 1), cloud.numpy())
-        for (row, column), cloud in zip(np.ndindex(side, side), answers.clouds, strict=True)
+        for (row, column), cloud in zip(np.ndindex(side, side), plane.clouds, strict=True)
     ]
     assert np.sqrt(np.mean(np.square(errors))) < 0.0025, "0.002 left out of the basis, and rounding"
-    assert np.ptp(answers.clouds.numpy(), axis=0).max() > 0.02, "and they differ by much more than that"
+    assert np.ptp(plane.clouds.numpy(), axis=0).max() > 0.02, "and they differ by much more than that"
     (at_code,) = model(images, codes[None])[0]
     assert _rms(_blended(packed, *packed["start"]), at_code.detach().numpy()) < 0.004
 
@@ -130,10 +130,10 @@ def test_pages_are_small_even_where_the_clouds_of_the_plane_share_nothing(tmp_pa
     image[:, 60:160, 80:130] = 0.3
     sizes = []
     for clouds in (smooth, rough):
-        answers = Answers(image, clouds, torch.rand(1024), torch.zeros(2), 2.5)
-        write_explorer(tmp_path / "page.html", [answers] * 3)
+        plane = CodePlane(image, clouds, torch.rand(1024), torch.zeros(2), 2.5)
+        write_explorer(tmp_path / "page.html", [plane] * 3)
         sizes.append((tmp_path / "page.html").stat().st_size)
-        for packed in _answers_in(tmp_path / "page.html"):
+        for packed in _planes_in(tmp_path / "page.html"):
             assert _rms(_blended(packed, -1, 1), clouds[110].numpy()) < 0.004
     assert sizes[0] < 250_000
     assert sizes[1] < 2_000_000
@@ -141,9 +141,9 @@ def test_pages_are_small_even_where_the_clouds_of_the_plane_share_nothing(tmp_pa
 
 def test_clouds_that_are_all_the_same_make_a_page(tmp_path: Path):
     cloud = torch.rand(50, 3)
-    answers = Answers(torch.ones(3, 8, 8), cloud.expand(121, -1, -1), torch.zeros(50), torch.zeros(2), 2.5)
-    write_explorer(tmp_path / "page.html", [answers])
-    assert _rms(_blended(_answers_in(tmp_path / "page.html")[0], 0.3, 0.1), cloud.numpy()) < 1e-4
+    plane = CodePlane(torch.ones(3, 8, 8), cloud.expand(121, -1, -1), torch.zeros(50), torch.zeros(2), 2.5)
+    write_explorer(tmp_path / "page.html", [plane])
+    assert _rms(_blended(_planes_in(tmp_path / "page.html")[0], 0.3, 0.1), cloud.numpy()) < 1e-4
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +166,7 @@ def test_the_command_writes_a_page_that_starts_where_the_images_agree(
     model, config, _ = open_run(smoke_run)
     images = read_images([picture.with_name(f"render_{i}.png") for i in range(3)])
     agreed = reconstruct(model, images, settings=config.inference).points[0].unflatten(0, (3, -1))
-    found = _answers_in(page)
+    found = _planes_in(page)
     assert len(found) == 3
     for packed, cloud in zip(found, agreed, strict=True):
         assert _rms(_blended(packed, *packed["start"]), cloud.numpy()) < 0.004
@@ -175,7 +175,7 @@ def test_the_command_writes_a_page_that_starts_where_the_images_agree(
     again = tmp_path / "again.html"
     files = [str(picture.with_name(f"render_{i}.png")) for i in range(3)]
     assert main(["explore", str(smoke_run), *files, "--out", str(again), "--seed", "0"]) == 0
-    for packed, same in zip(found, _answers_in(again), strict=True):
+    for packed, same in zip(found, _planes_in(again), strict=True):
         assert packed["start"] == pytest.approx(same["start"], abs=1e-3)
         assert _rms(_blended(packed, 0.7, -0.4), _blended(same, 0.7, -0.4)) < 1e-3
 
@@ -185,7 +185,7 @@ def test_reconstruct_writes_the_page_of_its_reconstruction(smoke_run: Path, pict
     assert main(["reconstruct", str(smoke_run), *files, "--out", str(tmp_path), "--steps", "1"]) == 0
     found = reconstruct(load_generator(smoke_run), read_images([Path(file) for file in files]), steps=1)
     for packed, cloud in zip(
-        _answers_in(tmp_path / "explore.html"), found.points[0].unflatten(0, (2, -1)), strict=True
+        _planes_in(tmp_path / "explore.html"), found.points[0].unflatten(0, (2, -1)), strict=True
     ):
         assert _rms(_blended(packed, *packed["start"]), cloud.numpy()) < 0.004
 
@@ -195,7 +195,7 @@ def weights(tmp_path: Path) -> dict[str, Path]:
     """Files of untrained networks that have nothing to explore."""
     voxels = get_method("r2n2")
     networks = {
-        "one answer": build_generator("smoke", deterministic=True),
+        "one prediction": build_generator("smoke", deterministic=True),
         "all images": voxels.network_class(voxels.sizes["smoke"]),  # type: ignore[call-arg]
         "no order": build_generator(
             config=dataclasses.replace(build_generator("smoke").config, occupancy_logits=True)
@@ -210,7 +210,7 @@ def weights(tmp_path: Path) -> dict[str, Path]:
 @pytest.mark.parametrize(
     ("name", "complaint"),
     [
-        ("one answer", "one prediction of an image, whatever the code"),
+        ("one prediction", "one prediction of an image, whatever the code"),
         ("all images", "one prediction of all images together"),
         ("no order", "points of two predictions do not correspond"),
     ],
@@ -354,7 +354,7 @@ def test_dragging_the_handle_changes_both_pictures(shown: _Shown):
 
 
 def test_the_page_draws_the_clouds_that_python_blends(shown: _Shown, page: Path):
-    for i, packed in enumerate(_answers_in(page)):
+    for i, packed in enumerate(_planes_in(page)):
         for place in ([0.0, 0.0], [-1.0, 1.0], [0.37, -0.81], packed["start"]):
             values = shown.tab.evaluate("([i, place]) => [...all[i].cloud(place)]", [i, place])
             np.testing.assert_allclose(
@@ -429,7 +429,7 @@ def test_wheel_and_drag_turn_and_zoom(shown: _Shown):
     assert len({*before, *zoomed, *shown.pictures()}) == 6
 
 
-def test_tabs_show_each_images_answers_and_what_all_agree_on(shown: _Shown):
+def test_tabs_show_each_images_predictions_and_what_all_agree_on(shown: _Shown):
     tab = shown.tab
     assert tab.get_by_role("tab", name="Agreed").get_attribute("aria-selected") == "true"
     pictures = {"agreed": shown.pictures()[0]}

@@ -26,7 +26,7 @@ from train.errors import UserError
 from train.experiments.registry import ABOUT_ALL, EXPERIMENTS, FORMER_NAMES
 from train.methods import METHODS, get_method
 
-# Torch and the kernels are imported by the commands, so that --help answers at once.
+# Torch and the kernels are imported by the commands, so that --help is fast.
 
 
 def _numbers(words: list[str]) -> tuple[int, ...]:

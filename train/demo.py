@@ -1,4 +1,4 @@
-"""The demo: what the shipped weights answer, then the whole chain from data to a report about a network of its own."""
+"""The demo: what the shipped weights predict, then the whole chain from data to a report about a network of its own."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def demo(
 
 
 def _shipped_weights(out: Path, *, seed: int, device: torch.device) -> list[str]:
-    """What the shipped weights answer, as a section of the report; also written as a page of its own at first.
+    """What the shipped weights predict, as a section of the report; also written as a page of its own at first.
 
     Pages to explore are written to out/shipped/.
     """
@@ -149,7 +149,7 @@ def _shipped_weights(out: Path, *, seed: int, device: torch.device) -> list[str]
             links["the photograph of a car"] = _explorer(out, path.stem, path, seed=seed, device=device)
     section = shipped_weights_section(examples, photographed, links)
     page = pages.page(
-        "What the shipped weights answer", section, subtitle="A small network of its own is next."
+        "What the shipped weights predict", section, subtitle="A small network of its own is next."
     )
     write_text(out / "report.html", page)
     write_text(kept, json.dumps(section))

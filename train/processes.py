@@ -213,10 +213,10 @@ def _serve(descriptor: int, parent: int) -> None:
                 function, call = pickle.loads(message)
                 if first:
                     _use_one_thread()
-                first, answer = False, pickle.dumps((True, function(*call), None))
+                first, message = False, pickle.dumps((True, function(*call), None))
             except BaseException as error:
-                answer = _pickled_error(error)
-            connection.send_bytes(answer)
+                message = _pickled_error(error)
+            connection.send_bytes(message)
 
 
 def _end_with_parent(parent: int) -> None:

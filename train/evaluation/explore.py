@@ -7,7 +7,7 @@ from torch import Tensor
 
 from models import Predictor
 from train.processes import progress_bar
-from train.show.explorer import Answers
+from train.show.explorer import CodePlane
 
 _CODES = 256
 _NODES = 11
@@ -32,7 +32,7 @@ def not_explorable(model: Predictor) -> str | None:
 @torch.no_grad()
 def explore(
     model: Predictor, images: Tensor, codes: Tensor, *, seed: int = 0, progress: bool = True
-) -> list[Answers]:
+) -> list[CodePlane]:
     """Predictions of each image on a grid of codes, in the plane along which they change most.
 
     The plane passes through the image's given code. Its two directions are orthonormal and found by regression of the
@@ -58,7 +58,7 @@ def explore(
         reach = max(_REACH, 1.1 * start.abs().max().item())
         nodes = code - start @ directions + reach * grid @ directions
         found.append(
-            Answers(
+            CodePlane(
                 image=image,
                 clouds=_decode(model, features, nodes),
                 spread=(clouds - clouds.mean(0)).square().sum(-1).mean(0).sqrt(),

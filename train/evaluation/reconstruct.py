@@ -62,7 +62,7 @@ def reconstruct_to_files(
     model, config, _ = open_run(run, device=device)
     found = reconstruct(model, pictures, groups=groups, steps=steps, seed=seed, settings=config.inference)
     points = found.points[0]
-    answers = None if not_explorable(model) else explore(model, pictures, found.codes[0], seed=seed)
+    planes = None if not_explorable(model) else explore(model, pictures, found.codes[0], seed=seed)
     made = f"{len(points)} points from {_count(images)}"
     if len(found.history):
         before, after = found.history[0, 0].item(), found.history[found.kept[0], 0].item()
@@ -72,8 +72,8 @@ def reconstruct_to_files(
     with replacing(out / "reconstruction.html") as page:
         write_reconstruction_page(page, pictures, points, title="Reconstruction", subtitle=made)
         write_points(out / "reconstruction.ply", points)
-        if answers:
-            write_explorer(out / "explore.html", answers)
+        if planes:
+            write_explorer(out / "explore.html", planes)
             written.append(out / "explore.html")
         else:
             remove(out / "explore.html")  # of an earlier reconstruction

@@ -20,14 +20,14 @@ from torch import Tensor
 from train.files import write_text
 
 _TEMPLATE = Path(__file__).with_name("explorer.html")
-_PLACE = '"answers go here"'
+_PLACE = '"planes go here"'
 _TOLERANCE = 0.002
 """World units, rms over points and grid codes: what the basis may leave out."""
 _WHITE = 248
 _MARGIN = 6  # pixels around the object
 
 
-class Answers(NamedTuple):
+class CodePlane(NamedTuple):
     """One image's predictions on a square grid of codes in a plane; point n corresponds in all of them.
 
     Attributes:
@@ -46,37 +46,37 @@ class Answers(NamedTuple):
     reach: float
 
 
-def write_explorer(path: str | Path, answers: Sequence[Answers]) -> None:
+def write_explorer(path: str | Path, planes: Sequence[CodePlane]) -> None:
     """Writes the page; several images of one object get a tab each, and one for what they agree on.
 
     Args:
         path: the .html file.
-        answers: of each image.
+        planes: one for each image.
     """
-    packed = json.dumps([_packed(each) for each in answers])
+    packed = json.dumps([_packed(each) for each in planes])
     write_text(path, _TEMPLATE.read_text(encoding="utf-8").replace(_PLACE, packed))
 
 
-def _packed(answers: Answers) -> dict[str, Any]:
+def _packed(plane: CodePlane) -> dict[str, Any]:
     """What the page needs, in JSON; arrays are little-endian bytes in base64, `*_scale` the value of their unit."""
-    clouds = answers.clouds.flatten(1).double().numpy()
+    clouds = plane.clouds.flatten(1).double().numpy()
     mean, mean_scale = _quantised(clouds.mean(0, keepdims=True), 16)
     changes = clouds - mean * mean_scale[:, None]
-    basis, basis_scale = _quantised(_basis(changes, points=answers.clouds.shape[1]), 8)
+    basis, basis_scale = _quantised(_basis(changes, points=plane.clouds.shape[1]), 8)
     # Fitted to the rounded basis, so that its errors partly cancel.
     weights = np.linalg.lstsq((basis * basis_scale[:, None]).T, changes.T, rcond=None)[0].T
-    spread = answers.spread.numpy()
+    spread = plane.spread.numpy()
     spread_scale = max(spread.max() / 255, 1e-9)
     return {
-        "image": _jpeg(answers.image),
+        "image": _jpeg(plane.image),
         "mean": _base64(mean),
         "mean_scale": mean_scale.item(),
         "basis": _base64(basis),
         "weights": _base64((weights * basis_scale).astype("<f4")),
         "spread": _base64((spread / spread_scale).round().astype(np.uint8)),
         "spread_scale": float(spread_scale),
-        "start": answers.start.tolist(),
-        "reach": answers.reach,
+        "start": plane.start.tolist(),
+        "reach": plane.reach,
     }
 
 

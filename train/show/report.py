@@ -106,7 +106,7 @@ def write_report(
 def shipped_weights_section(
     examples: Sequence[Example], photographed: Sequence[figures.Photographed], explorers: Mapping[str, str]
 ) -> list[str]:
-    """What the weights that come with the repository answer: unseen shapes, photographs, and pages to explore.
+    """What the weights that come with the repository predict: unseen shapes, photographs, and pages to explore.
 
     Args:
         examples: shapes that the weights were not trained on.
