@@ -188,6 +188,22 @@ def test_few_jobs_are_done_in_this_process() -> None:
     assert {pid for _, pid in results} == {os.getpid()}
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no way to give a process one core")
+def test_a_process_with_one_core_starts_no_others() -> None:
+    code = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import train.processes
+from train.processes import map_unordered
+train.processes._results = None  # would start workers
+assert len(list(map_unordered(abs, range(-32, 0), processes=None, title="many", unit="job", progress=False))) == 32
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False, cwd=REPOSITORY
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_log_file_gets_a_line_now_and_then(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

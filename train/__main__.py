@@ -285,10 +285,11 @@ class Experiment:
     device: Device = "auto"
 
     def run(self) -> None:
+        from diffpoint import runtime_info
         from train.experiments.run import Study, print_status, run_all, run_experiment, write_page
 
         device = _use_device(self.device)
-        usual = 1 if device.type == "cuda" else os.cpu_count() or 1
+        usual = 1 if device.type == "cuda" else runtime_info().threads
         processes = usual if self.processes is None else self.processes
         study = Study(
             self.data, self.out, self.profile, self.seeds, self.limit, self.steps, processes=processes,

@@ -77,7 +77,8 @@ def map_unordered(
     Args:
         function: importable by name; returns what is wrong with a job instead of raising it.
         jobs: can be pickled.
-        processes: how many work at once; 1 means this process. None: one per core, if there are enough jobs.
+        processes: how many work at once; 1 means this process. None: one per core that this
+            process may use, if there are enough jobs.
         title: shown before the bar.
         unit: what a job is.
         progress: show a progress bar.
@@ -90,7 +91,9 @@ def map_unordered(
     if os.name == "nt":
         processes = 1  # workers get their pipe in a way that Windows does not have
     if processes is None:
-        processes = min(os.cpu_count() or 1, len(jobs) // jobs_per_process)
+        from diffpoint import runtime_info  # here, for it imports torch
+
+        processes = min(runtime_info().threads, len(jobs) // jobs_per_process)
     if processes > 1:
         crash = OSError("the process that worked on it crashed or ran out of memory")
         results = _results(function, [(job,) for job in jobs], processes, crash=crash)
