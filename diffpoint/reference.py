@@ -305,7 +305,7 @@ def chamfer_distance(
         if reduction == "mean":
             d = d.sum(-1) / count
         elif reduction != "none":
-            d = d.sum(-1) if reduction == "sum" else d.amax(-1)
+            d = d.sum(-1) if reduction == "sum" or d.shape[-1] == 0 else d.amax(-1)
         directions.append(d)
     return directions[0], directions[1]
 
