@@ -1,11 +1,11 @@
-# make demo | test | slow | check | bench | publish | docs | clean. Each installs what it needs into .venv first.
+# make demo | test | slow | check | bench | publish | docs | dist | clean. Each installs what it needs into .venv first.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # torch's OpenMP threads would otherwise spin after each op and slow the next kernel.
 export OMP_WAIT_POLICY := passive
 
-.PHONY: demo test slow check bench publish docs clean
+.PHONY: demo test slow check bench publish docs dist clean
 .DEFAULT_GOAL := test
 
 $(VENV)/installed: pyproject.toml constraints.txt
@@ -49,6 +49,13 @@ docs: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	$(BIN)/python -m sphinx -q -W --keep-going docs docs/_build
 	@echo "open docs/_build/index.html"
+
+# What is uploaded for a release (docs/releasing.md): built, checked, and installed into an empty environment.
+dist: $(VENV)/installed
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/python -m pytest -m slow tests/test_wheel.py
 
 clean:
 	rm -rf $(VENV) docs/_build dist .pytest_cache .ruff_cache .hypothesis

@@ -6,7 +6,20 @@ from diffpoint._bridge import check_pending
 from diffpoint._conversions import OpenGLCamera, PyTorch3DCamera
 from diffpoint._runtime import RuntimeInfo, configure, runtime_info
 from diffpoint.camera import PinholeCamera, PointSets, Projection
-from diffpoint.distances import Chamfer, FScore, Nearest, chamfer_distance, f_score, nearest
+from diffpoint.completion import (
+    minimal_matching_distance,
+    total_mutual_difference,
+    unidirectional_hausdorff_distance,
+)
+from diffpoint.distances import (
+    Chamfer,
+    FScore,
+    Nearest,
+    chamfer_distance,
+    f_score,
+    hausdorff_distance,
+    nearest,
+)
 from diffpoint.losses import (
     FrontSets,
     FrontTerms,
@@ -59,7 +72,9 @@ __all__ = [
     "front_constraint",
     "front_sets",
     "front_terms",
+    "hausdorff_distance",
     "knn",
+    "minimal_matching_distance",
     "nearest",
     "project",
     "projection_loss",
@@ -69,6 +84,8 @@ __all__ = [
     "soft_projection_loss",
     "soft_splat",
     "splat_depth",
+    "total_mutual_difference",
+    "unidirectional_hausdorff_distance",
     "unproject",
     "visible_points",
 ]

@@ -95,7 +95,7 @@ def chamfer_distance(
         b: (*B, M, 3) or (*B, M, 2) points, same unit, dtype and leading dimensions.
         squared: True for squared distances (unit^2), False for distances (unit).
         reduction: over the points of each cloud: "mean"; "sum"; "max", the directed Hausdorff distances, of which
-            `torch.maximum(*chamfer)` is the Hausdorff distance; or "none" for the distance of each point, for instance
+            the larger is `hausdorff_distance`; or "none" for the distance of each point, for instance
             to weight them. There is none over the batch.
         a_lengths: (*B) int64, how many of the N points count; default all.
         b_lengths: (*B) int64, how many of the M points count; default all.
@@ -129,6 +129,42 @@ def _reduced(distance: Tensor, lengths: Tensor, reduction: str) -> Tensor:
         return distance.amax(-1) if distance.shape[-1] else distance.sum(-1)  # a batch of no clouds
     total = distance.sum(-1)
     return total / lengths if reduction == "mean" else total
+
+
+def hausdorff_distance(
+    a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+) -> Tensor:
+    """max(max_i min_j |a_i - b_j|, max_j min_i |a_i - b_j|): the farthest that a point of one set is from the other.
+
+    One outlier decides it. `chamfer_distance` with the reduction "max" has both directions, the directed Hausdorff
+    distances.
+
+    Args:
+        a: (*B, N, 3) or (*B, N, 2) points, any unit.
+        b: (*B, M, 3) or (*B, M, 2) points, same unit, dtype and leading dimensions.
+        a_lengths: (*B) int64, how many of the N points count; default all.
+        b_lengths: (*B) int64, how many of the M points count; default all.
+
+    Returns:
+        (*B), in the unit of the points.
+
+    Gradients: to the pair of points that decides, in equal shares if there are several; 0 at distance 0.
+
+    Raises:
+        ValueError, TypeError: wrong shapes, dtypes or devices, an empty set, NaN or infinite coordinates.
+
+    Example:
+        >>> a = torch.zeros(1, 1, 3); b = torch.tensor([[[3.0, 4.0, 0.0], [0.0, 0.0, 1.0]]])
+        >>> hausdorff_distance(a, b).item()
+        5.0
+    """
+    paired_sets("hausdorff_distance", a, b, a_lengths, b_lengths)  # errors are to name this function
+    _checks.check_finite("hausdorff_distance", "a", a.detach(), a_lengths)
+    _checks.check_finite("hausdorff_distance", "b", b.detach(), b_lengths)
+    directed = chamfer_distance(
+        a, b, squared=False, reduction="max", a_lengths=a_lengths, b_lengths=b_lengths
+    )
+    return torch.maximum(*directed)
 
 
 def f_score(

@@ -285,7 +285,7 @@ def diversity_loss(
     _checks.check_same_dtype("diversity_loss", codes=codes, clouds=clouds)
     alpha = _checks.check_number("diversity_loss", "alpha", alpha, "be finite", math.isfinite)
     _checks.check_finite("diversity_loss", "codes", codes.detach())
-    first, second = _pairs("diversity_loss", "codes", codes.shape[0])
+    first, second = pairs("diversity_loss", "codes", codes.shape[0])
     apart = (codes[first] - codes[second]).norm(dim=-1)
     # From this distance on the hinge is 0, so the exact distance is not needed.
     enough = apart / alpha if alpha > 0 else None
@@ -315,12 +315,12 @@ def consistency_loss(clouds: Tensor, *, reduction: Reduction = "mean") -> Tensor
         1.3333333730697632
     """
     _checks.check_tensor("consistency_loss", "clouds", clouds, ("*", "V", "N", 3))
-    first, second = _pairs("consistency_loss", "clouds", clouds.shape[-3])
+    first, second = pairs("consistency_loss", "clouds", clouds.shape[-3])
     both = chamfer_distance(clouds[..., first, :, :], clouds[..., second, :, :], squared=False)
     return reduce_loss("consistency_loss", both.total.mean(-1), reduction)
 
 
-def _pairs(function: str, argument: str, count: int) -> tuple[list[int], list[int]]:
+def pairs(function: str, argument: str, count: int) -> tuple[list[int], list[int]]:
     """All i < j < `count`, as the list of i and the list of j."""
     if count < 2:
         raise _checks.fail(function, argument, "hold at least two to compare", str(count))

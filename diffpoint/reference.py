@@ -305,9 +305,17 @@ def chamfer_distance(
         if reduction == "mean":
             d = d.sum(-1) / count
         elif reduction != "none":
-            d = d.sum(-1) if reduction == "sum" else d.amax(-1)
+            d = d.sum(-1) if reduction == "sum" or d.shape[-1] == 0 else d.amax(-1)
         directions.append(d)
     return directions[0], directions[1]
+
+
+def hausdorff_distance(
+    a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+) -> Tensor:
+    """(*B)."""
+    lengths = {"a_lengths": a_lengths, "b_lengths": b_lengths}
+    return torch.maximum(*chamfer_distance(a, b, squared=False, reduction="max", **lengths))
 
 
 def f_score(
@@ -474,6 +482,40 @@ def consistency_loss(clouds: Tensor) -> Tensor:
         for i, j in itertools.combinations(range(clouds.shape[-3]), 2)
     ]
     return torch.stack(terms).mean(0)
+
+
+def minimal_matching_distance(samples: Tensor, references: Tensor, *, squared: bool) -> Tensor:
+    """(*B, R)."""
+    matched = []
+    for reference in references.unbind(-3):
+        distances = [
+            torch.stack(chamfer_distance(sample, reference, squared=squared)).sum(0)
+            for sample in samples.unbind(-3)
+        ]
+        matched.append(torch.stack(distances).min(0).values)
+    return torch.stack(matched, -1)
+
+
+def total_mutual_difference(clouds: Tensor, *, squared: bool) -> Tensor:
+    """(*B)."""
+    shapes = clouds.unbind(-3)
+    total = clouds.new_zeros(clouds.shape[:-3])
+    for i, one in enumerate(shapes):
+        others = [shape for j, shape in enumerate(shapes) if j != i]
+        distances = [torch.stack(chamfer_distance(one, other, squared=squared)).sum(0) for other in others]
+        total = total + torch.stack(distances).mean(0)
+    return total
+
+
+def unidirectional_hausdorff_distance(
+    partial: Tensor, completions: Tensor, *, partial_lengths: Tensor | None = None
+) -> Tensor:
+    """(*B)."""
+    directed = [
+        _sqrt(nearest(partial, completion, a_lengths=partial_lengths)[0].amax(-1))
+        for completion in completions.unbind(-3)
+    ]
+    return torch.stack(directed).mean(0)
 
 
 def _mask(points: Tensor, lengths: Tensor) -> Tensor:

@@ -151,7 +151,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--iterations", type=int, default=200, help="steps of Adam for each fit (%(default)s)")
     arguments = parser.parse_args(argv)
     if arguments.iterations < 20:
-        parser.error("--iterations must be at least 20; 200 is what the README's table is made with")
+        parser.error("--iterations must be at least 20; 200 is what docs/gallery.md is made with")
     arguments.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)  # the tensors are so small that torch's threads would wait more than they work
 

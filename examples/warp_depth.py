@@ -161,7 +161,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--shift", type=float, default=0.15, help="its shift; the shape is about 1 across (%(default)s)")
     arguments = parser.parse_args(argv)
     if arguments.iterations < 20:
-        parser.error("--iterations must be at least 20; 200 is what the README's table is made with")
+        parser.error("--iterations must be at least 20; 200 is what docs/gallery.md is made with")
     arguments.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)  # the tensors are so small that torch's threads would wait more than they work
 

@@ -115,6 +115,16 @@ OPS: dict[str, Callable[[], list[Tensor]]] = {
         for sizes in ((1, 900, 700), (5, 300, 400), (2, 3000, 3100))
         for t in both(lambda a, b: dp.chamfer_distance(a, b, squared=False), *sizes)
     ],
+    "hausdorff_distance": lambda: both(lambda a, b: (dp.hausdorff_distance(a, b),), 5, 300, 400),
+    "minimal_matching_distance": lambda: both(
+        lambda a, b: (dp.minimal_matching_distance(a, b, squared=True),), 5, 300, 400
+    ),
+    "total_mutual_difference": lambda: alone(
+        lambda x: (dp.total_mutual_difference(x, squared=True),), 5, 300
+    ),
+    "unidirectional_hausdorff_distance": lambda: alone(
+        lambda x: (dp.unidirectional_hausdorff_distance(x[0], x[1:]),), 5, 300
+    ),
     "earth_mover_distance": lambda: [
         t
         for sizes in ((1, 600, 600), (5, 300, 400))

@@ -12,7 +12,7 @@ from PIL import Image
 from trees import all_shapes
 
 from train.data.categories import category_of
-from train.data.game_meshes import read_ac3d, read_md2, triangulate
+from train.data.game_meshes import read_ac3d, read_md2
 from train.data.mesh_sources import find_meshes, read_labels
 from train.data.meshes import MeshError, convert, load_surface
 
@@ -106,28 +106,6 @@ def test_files_of_careless_writers_are_read():
     part = ac_object(TRIANGLE, [("0x20", 0, plain((0, 1, 2)))]).replace("1 0 0\n", "1 0 0\n\n", 1)
     content = world(part, kids=3).replace("\n", "\r\n").encode()
     assert len(triangles_of(read_ac3d(content, no_files))[0]) == 1
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("backwards", [False, True])
-def test_concave_polygons_are_covered_once(axis, backwards):
-    """A comb with three teeth, in each of the three planes and both directions: a fan would fill the gaps."""
-    outline = [(0, 0), (5, 0), (5, 3), (4, 3), (4, 1), (3, 1), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)]
-    polygon = np.insert(np.array(outline, float), axis, 2.0, axis=1)
-    polygon[:, axis] += 0.1 * polygon[:, (axis + 1) % 3]  # not along an axis
-    if backwards:
-        polygon = polygon[::-1]
-    triangles = polygon[np.array(triangulate([tuple(corner) for corner in polygon.tolist()]))]
-    assert len(triangles) == len(outline) - 2
-    flat = np.delete(triangles, axis, axis=2)
-    sides = flat[:, 1:] - flat[:, :1]
-    areas = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]) / 2
-    assert areas.sum() == pytest.approx(5 * 3 - 2 * 2)
-
-
-def test_a_polygon_that_crosses_itself_still_becomes_triangles():
-    assert len(triangulate([(0, 0, 0), (1, 1, 0), (1, 0, 0), (0, 1, 0)])) == 2
-    assert triangulate([(0, 0, 0), (1, 0, 0)]) == []
 
 
 def textured(tmp_path, picture, before=""):

@@ -210,6 +210,11 @@ def test_the_largest_directed_distance_is_scipys_hausdorff_distance():
     directed = dp.chamfer_distance(a, b, squared=False, reduction="max")
     scipys = [directed_hausdorff(x, y)[0] for x, y in ((a, b), (b, a))]
     assert torch.stack(directed).tolist() == pytest.approx(scipys)
+    assert dp.hausdorff_distance(a, b).item() == pytest.approx(max(scipys))
+    assert torch.equal(dp.hausdorff_distance(b, a), dp.hausdorff_distance(a, b))
+    plane = dp.hausdorff_distance(a[:, :2], b[:, :2], a_lengths=torch.tensor(40))
+    scipys = [directed_hausdorff(x, y)[0] for x, y in ((a[:40, :2], b[:, :2]), (b[:, :2], a[:40, :2]))]
+    assert plane.item() == pytest.approx(max(scipys))
 
 
 def test_the_f_score_counts_points_within_the_threshold():

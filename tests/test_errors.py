@@ -33,6 +33,8 @@ SETS: Ops = {
     "f_score b": lambda x: dp.f_score(torch.rand(2, 5, 3), x, 0.1),
     "chamfer_distance a": lambda x: dp.chamfer_distance(x, torch.rand(2, 5, 3), squared=True),
     "chamfer_distance b": lambda x: dp.chamfer_distance(torch.rand(2, 5, 3), x, squared=True),
+    "hausdorff_distance a": lambda x: dp.hausdorff_distance(x, torch.rand(2, 5, 3)),
+    "hausdorff_distance b": lambda x: dp.hausdorff_distance(torch.rand(2, 5, 3), x),
     "earth_mover_distance a": lambda x: dp.earth_mover_distance(x, torch.rand(2, 5, 3)),
     "earth_mover_distance b": lambda x: dp.earth_mover_distance(torch.rand(2, 5, 3), x),
     "approxmatch a": lambda x: dp.approxmatch(x, torch.rand(2, 5, 3)),
@@ -44,6 +46,21 @@ STACKS: Ops = {
         torch.rand(2, 2, 4), x[None].expand(2, *x.shape), alpha=1.0
     ),
     "consistency_loss clouds": lambda x: dp.consistency_loss(x[:, None].expand(-1, 2, *x.shape[1:])),
+    "total_mutual_difference clouds": lambda x: dp.total_mutual_difference(
+        x[:, None].expand(-1, 2, *x.shape[1:]), squared=True
+    ),
+    "minimal_matching_distance samples": lambda x: dp.minimal_matching_distance(
+        x, torch.rand(4, 5, 3), squared=True
+    ),
+    "minimal_matching_distance references": lambda x: dp.minimal_matching_distance(
+        torch.rand(4, 5, 3), x, squared=True
+    ),
+    "unidirectional_hausdorff_distance partial": lambda x: dp.unidirectional_hausdorff_distance(
+        x, torch.rand(2, 4, 5, 3)
+    ),
+    "unidirectional_hausdorff_distance completions": lambda x: dp.unidirectional_hausdorff_distance(
+        torch.rand(5, 3), x
+    ),
 }
 MAPS: Ops = {
     "unproject": lambda d: dp.unproject(d, CAMERA),
@@ -142,6 +159,7 @@ def test_empty_sets_have_no_distance():
     for function in (
         lambda a, b, **k: dp.chamfer_distance(a, b, squared=False, **k),
         lambda a, b, **k: dp.f_score(a, b, 0.1, **k),
+        dp.hausdorff_distance,
         dp.earth_mover_distance,
     ):
         for a, b in ((full, empty), (empty, full)):
@@ -324,6 +342,7 @@ NO_CAMERA = CAMERA.expand(0, 2)
 def test_an_empty_batch_has_an_empty_result(count):
     """Whatever the size of its sets: none of them is empty."""
     points = torch.zeros(0, count, 3, requires_grad=True)
+    stack = points[:, None].expand(0, 2, count, 3)
     depth = torch.zeros(0, 2, 8, 8)
     results = [
         *dp.nearest(points, points),
@@ -334,10 +353,14 @@ def test_an_empty_batch_has_an_empty_result(count):
             for x in dp.chamfer_distance(points, points, squared=True, reduction=how)
         ),
         *dp.f_score(points, points, 0.1),
+        dp.hausdorff_distance(points, points),
         *dp.earth_mover_distance(points, points),
         dp.approxmatch(points, points),
         dp.farthest_point_sample(points, 3),
-        dp.consistency_loss(points[:, None].expand(0, 2, count, 3), reduction="none"),
+        dp.consistency_loss(stack, reduction="none"),
+        dp.total_mutual_difference(stack, squared=True, reduction="none"),
+        dp.minimal_matching_distance(stack, stack, squared=True, reduction="none"),
+        dp.unidirectional_hausdorff_distance(points, stack, reduction="none"),
         dp.diversity_loss(
             torch.ones(2, 0, 4), points[None].expand(2, 0, count, 3), alpha=1.0, reduction="none"
         ),

@@ -1,4 +1,4 @@
-"""The project: direction of imports, content of the wheel, documentation of the public names."""
+"""The project: direction of imports, documentation of the public names."""
 
 import doctest
 import inspect
@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import diffpoint
@@ -59,19 +58,3 @@ def test_public_functions_are_documented_with_an_example_and_few_parameters():
         if inspect.isfunction(item):
             assert len(inspect.signature(item).parameters) <= 8, f"{name} has too many parameters"
             assert doctest.DocTestParser().get_examples(item.__doc__), f"{name} has no example"
-
-
-def test_the_wheel_holds_the_layer_only(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path, ROOT],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    (wheel,) = tmp_path.glob("*.whl")
-    names = zipfile.ZipFile(wheel).namelist()
-    top = {name.split("/")[0] for name in names}
-    assert top == {"diffpoint", f"diffpoint-{diffpoint.__version__}.dist-info"}
-    sources = {str(path.relative_to(ROOT)) for path in (ROOT / "diffpoint").rglob("*.py")}
-    assert sources <= set(names)
-    assert "diffpoint/py.typed" in names

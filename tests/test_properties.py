@@ -71,6 +71,7 @@ def arguments(name: str, largest: int, family: str) -> tuple[st.SearchStrategy, 
             st.booleans(),
         ),
         "chamfer_distance": (strategies.pairs(largest, family),),
+        "hausdorff_distance": (strategies.pairs(largest, family),),
         "f_score": (strategies.pairs(largest, family), st.sampled_from([0.0, 1e-6, 0.1, 1e9])),
         "earth_mover_distance": (strategies.pairs(largest // 2, family),),
         "approxmatch": (strategies.pairs(largest // 2, family),),
@@ -100,6 +101,9 @@ def arguments(name: str, largest: int, family: str) -> tuple[st.SearchStrategy, 
             st.sampled_from([None, None, None, math.nan, math.inf]),
         ),
         "consistency_loss": (batches(largest, family),),
+        "minimal_matching_distance": (batches(largest, family), st.booleans()),
+        "total_mutual_difference": (batches(largest, family), st.booleans()),
+        "unidirectional_hausdorff_distance": (batches(largest, family),),
     }[name]
 
 

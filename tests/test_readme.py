@@ -1,26 +1,42 @@
-"""What the pages promise runs as it stands: the README, also from an installed wheel, and the tables of the docs."""
+"""What the pages promise runs as it stands: the README and the docs."""
 
 from __future__ import annotations
 
 import doctest
 import re
+import shlex
 import subprocess
 import sys
-import sysconfig
-import venv
 from pathlib import Path
 
 import pytest
 import torch
 
 import diffpoint
+from train.__main__ import _parse, renamed_options
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "reference").glob("*.md")),
+    ROOT / "train" / "pretrained" / "README.md",
+    ROOT / "examples" / "photographs" / "README.md",
+]
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    """The code blocks of a page in one of the languages; "" is the language of a block that names none."""
+    found = re.findall(r"^```(.*)\n((?s:.*?))^```$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return [block for language, block in found if language in languages]
 
 
 def python_blocks(page: Path) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    return blocks(page, "python")
+
+
+def pages_with(*languages: str) -> list:
+    return [pytest.param(page, id=page.stem) for page in PAGES if blocks(page, *languages)]
 
 
 def readme_example() -> str:
@@ -35,15 +51,67 @@ def test_the_readmes_example_runs():
     assert 0 < results["cost"].item() < 1
 
 
-@pytest.mark.parametrize(
-    "page", [p for p in PAGES if ">>>" in p.read_text(encoding="utf-8")], ids=lambda p: p.stem
-)
-def test_a_pages_examples_print_what_they_say(page):
-    failed, tried = doctest.testfile(
-        str(page), module_relative=False, optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
-    )
-    assert tried > 0
-    assert failed == 0
+def test_every_block_is_in_a_language_that_is_tested():
+    """Nothing is shown as code that no test would look at: Python, shell, or the directives of the pages."""
+    tested = {"python", "sh", ""}
+    for page in PAGES:
+        found = set(re.findall(r"^```(\S+)$", page.read_text(encoding="utf-8"), re.MULTILINE))
+        assert found - {"{eval-rst}", "{toctree}"} <= tested, page
+
+
+@pytest.mark.parametrize("page", pages_with("python"))
+def test_the_python_of_a_page_runs_from_top_to_bottom(page, monkeypatch):
+    """Examples of an interactive session print what they say; other blocks run, with the names of those before."""
+    monkeypatch.chdir(ROOT)
+    torch.manual_seed(0)
+    sessions = [block for block in python_blocks(page) if block.startswith(">>>")]
+    names: dict[str, object] = {}
+    for block in python_blocks(page):
+        if block not in sessions:
+            exec(compile(block, page.name, "exec"), names)
+    if sessions:
+        failed, tried = doctest.testfile(
+            str(page), module_relative=False, optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
+        )
+        assert tried > 0
+        assert failed == 0
+
+
+def commands(page: Path) -> list[str]:
+    """The commands of a page, one a line: continued lines joined, without prompts, comments and output."""
+    lines: list[str] = []
+    for block in blocks(page, "sh", ""):
+        joined = re.sub(r"\\\n\s*", " ", block).splitlines()
+        prompted = [line for line in joined if line.startswith("$ ")]
+        lines += [line.removeprefix("$ ") for line in prompted or joined]
+    return [re.sub(r"(^|\s)#.*", "", line).strip() for line in lines]
+
+
+@pytest.mark.parametrize("page", pages_with("sh", ""))
+def test_the_commands_of_a_page_exist_and_take_their_options(page):
+    """They are not run: many take hours, or need data that are not here. Their command lines are read as if."""
+    makefile, project = ((ROOT / name).read_text(encoding="utf-8") for name in ("Makefile", "pyproject.toml"))
+    for line in commands(page):
+        if "-m train" in line:  # also behind torchrun
+            words = shlex.split(line)
+            _parse(renamed_options(words[words.index("train") + 1 :]))
+        elif line.startswith("python examples/"):
+            words = line.split()
+            script = (ROOT / words[1]).read_text(encoding="utf-8")
+            assert all(f'add("{option}"' in script for option in words if option.startswith("--")), line
+        elif line.startswith("make "):
+            assert re.search(rf"^{line.split()[1]}:", makefile, re.MULTILINE), line
+        elif line.startswith("pip install"):
+            for extra in re.findall(r"\[(\w+)\]", line):
+                assert re.search(rf"^{extra} = \[", project, re.MULTILINE), line
+
+
+def test_a_command_that_does_not_exist_is_noticed(tmp_path):
+    page = tmp_path / "page.md"
+    for line in ("python -m train fit --data a --out b --no-such-option 1", "make nothing"):
+        page.write_text(f"```\n{line}\n```\n")
+        with pytest.raises((SystemExit, AssertionError)):
+            test_the_commands_of_a_page_exist_and_take_their_options(page)
 
 
 def lines_here(page: str) -> list[str]:
@@ -108,39 +176,3 @@ def test_the_docs_build_without_a_warning(tmp_path):
     assert "each a mean over its own set" in (tmp_path / "reference/distances.html").read_text(
         encoding="utf-8"
     )
-
-
-@pytest.mark.slow
-def test_the_wheel_runs_the_readmes_example_in_an_empty_environment(tmp_path):
-    """Only the wheel is installed there; torch, taichi and numpy are lent, behind it on the path."""
-    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(ROOT)]
-    subprocess.run(build, check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    empty = tmp_path / "venv"
-    venv.create(empty, with_pip=False)
-    python = empty / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
-    ask = [str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
-    site_packages = Path(subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip())
-    install = [
-        sys.executable,
-        "-m",
-        "pip",
-        "--python",
-        str(python),
-        "install",
-        "--no-deps",
-        "--no-index",
-        str(wheel),
-    ]
-    subprocess.run(install, check=True, capture_output=True)
-    # A plain line in a .pth file is appended to the path, so that nothing lent hides what was installed.
-    (site_packages / "lent.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    script = tmp_path / "example.py"
-    script.write_text(readme_example() + "\nprint(dp.__file__)\nprint(cost.item() > 0)\n")
-    done = subprocess.run(
-        [str(python), "-E", str(script)], capture_output=True, text=True, cwd=tmp_path, timeout=240
-    )
-    assert done.returncode == 0, done.stderr
-    imported, positive = done.stdout.split()
-    assert Path(imported).is_relative_to(site_packages)
-    assert positive == "True"

@@ -177,6 +177,18 @@ def stacks(dtype: torch.dtype) -> Leaves:
     return codes, torch.stack([clouds(dtype, 8, seed=seed) for seed in (4, 5, 6)])
 
 
+def matching(*, squared: bool) -> Case:
+    """Three samples against the four clouds of another stack, of another size."""
+    return Case(
+        lambda dtype: (
+            torch.stack([clouds(dtype, 8, seed=seed) for seed in (4, 5, 6)], 1),
+            torch.stack([clouds(dtype, 11, seed=seed) for seed in (7, 8, 9, 10)], 1),
+        ),
+        lambda a, b: dp.minimal_matching_distance(a, b, squared=squared, reduction="none"),
+        lambda a, b: reference.minimal_matching_distance(a, b, squared=squared),
+    )
+
+
 CASES = {
     "nearest": two_sets("nearest"),
     "knn": two_sets("knn", k=5),
@@ -191,6 +203,7 @@ CASES = {
     "chamfer_distance, sum": two_sets("chamfer_distance", squared=False, reduction="sum"),
     "chamfer_distance, max": two_sets("chamfer_distance", squared=True, reduction="max"),
     "chamfer_distance, none": two_sets("chamfer_distance", squared=False, reduction="none"),
+    "hausdorff_distance": two_sets("hausdorff_distance"),
     "earth_mover_distance": Case(
         sets,
         lambda a, b: dp.earth_mover_distance(a, b, a_lengths=LENGTHS, tolerance=1e-7)[:2],
@@ -233,6 +246,22 @@ CASES = {
         stacks,
         lambda codes, shapes: dp.diversity_loss(codes, shapes, alpha=3.0, tolerance=1e-6, reduction="none"),
         lambda codes, shapes: reference.diversity_loss(codes, shapes, alpha=3.0),
+    ),
+    "minimal_matching_distance": matching(squared=True),
+    "minimal_matching_distance, not squared": matching(squared=False),
+    "unidirectional_hausdorff_distance": Case(
+        lambda dtype: (clouds(dtype, seed=7), stacks(dtype)[1].transpose(0, 1)),
+        lambda partial, shapes: dp.unidirectional_hausdorff_distance(
+            partial, shapes, partial_lengths=LENGTHS, reduction="none"
+        ),
+        lambda partial, shapes: reference.unidirectional_hausdorff_distance(
+            partial, shapes, partial_lengths=LENGTHS
+        ),
+    ),
+    "total_mutual_difference": Case(
+        lambda dtype: stacks(dtype)[1:],
+        lambda shapes: dp.total_mutual_difference(shapes.transpose(0, 1), squared=True, reduction="none"),
+        lambda shapes: reference.total_mutual_difference(shapes.transpose(0, 1), squared=True),
     ),
     "consistency_loss": Case(
         lambda dtype: stacks(dtype)[1:],

@@ -115,6 +115,22 @@ def check_chamfer_distance(recipes: tuple[strategies.Recipe, strategies.Recipe])
     return AGREED
 
 
+def check_hausdorff_distance(recipes: tuple[strategies.Recipe, strategies.Recipe]) -> str:
+    a, b = (r.make() for r in recipes)
+    lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}
+    result = refuse_or_run(
+        lambda: dp.hausdorff_distance(a.points, b.points, **lengths),
+        a.poisoned or b.poisoned or _empty(a, b),
+        *("hausdorff_distance", "chamfer_distance"),
+    )
+    if result is None:
+        return REFUSED
+    expected = reference.hausdorff_distance(a.clean, b.clean, **lengths)
+    assert_within(result, expected, 100 * eps(result.dtype) * expected)
+    assert_finite_gradients(result, a.points, b.points)
+    return AGREED
+
+
 def check_f_score(recipes: tuple[strategies.Recipe, strategies.Recipe], threshold: float) -> str:
     a, b = (r.make() for r in recipes)
     lengths = {"a_lengths": a.lengths, "b_lengths": b.lengths}

@@ -116,3 +116,38 @@ def check_consistency_loss(recipe: strategies.Recipe) -> str:
     assert_within(loss, expected, 100 * eps(recipe.dtype) * expected)
     assert_finite_gradients(loss, cloud.points)
     return AGREED
+
+
+def check_minimal_matching_distance(recipe: strategies.Recipe, squared: bool) -> str:
+    return completions_agree(
+        "minimal_matching_distance", recipe, lambda shapes: (shapes, 0.9 * shapes.flip(-3)), squared=squared
+    )
+
+
+def check_total_mutual_difference(recipe: strategies.Recipe, squared: bool) -> str:
+    return completions_agree(
+        "total_mutual_difference", recipe, lambda shapes: (shapes,), fewest=2, squared=squared
+    )
+
+
+def check_unidirectional_hausdorff_distance(recipe: strategies.Recipe) -> str:
+    return completions_agree(
+        "unidirectional_hausdorff_distance", recipe, lambda shapes: (0.9 * shapes.flatten(-3, -2), shapes)
+    )
+
+
+def completions_agree(
+    name: str, recipe: strategies.Recipe, arguments: Callable, *, fewest: int = 1, **options
+) -> str:
+    """Of a metric of several shapes for each input; `arguments` makes its tensors of these."""
+    cloud = recipe.make()
+    refuse = cloud.poisoned or recipe.batch[-1] < fewest or recipe.count == 0 or 0 in recipe.batch
+    result = refuse_or_run(
+        lambda: getattr(dp, name)(*arguments(cloud.points), **options), refuse, name, "chamfer_distance"
+    )
+    if result is None:
+        return REFUSED
+    expected = getattr(reference, name)(*arguments(cloud.clean), **options).mean()
+    assert_within(result, expected, 100 * eps(recipe.dtype) * expected)
+    assert_finite_gradients(result, cloud.points)
+    return AGREED

@@ -5,12 +5,15 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
 from PIL import Image
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import SimpleMaterial
+
+from train.data.polygons import triangulate
 
 FileContent = Callable[[str], bytes]
 """The content of a file that a mesh names; FileNotFoundError if there is none."""
@@ -122,6 +125,13 @@ class _Lines:
         return [(float(row[0]), float(row[1]), float(row[2])) for row in rows]
 
 
+class _Ac3dSurface(NamedTuple):
+    kind: int
+    material: int
+    corners: list[tuple[float, float, float]]
+    """Index of the vertex, u and v."""
+
+
 class _Ac3dObject:
     """An object without its children, as it is written: vertices in its own frame."""
 
@@ -157,12 +167,24 @@ class _Ac3dObject:
             elif word == "numvert":
                 self.vertices = lines.triples(int(rest))
             elif word == "numsurf":
-                for _ in range(int(rest)):
-                    self._read_surface(lines)
+                self._add([self._read_surface(lines) for _ in range(int(rest))])
         if _EFFECT.search(self.name):
             self.triangles = {}
 
-    def _read_surface(self, lines: _Lines) -> None:
+    def _add(self, surfaces: Sequence[_Ac3dSurface]) -> None:
+        polygons = [
+            [] if each.kind in (*_LINES, _STRIP) else [int(index) for index, _, _ in each.corners]
+            for each in surfaces
+        ]
+        vertices = np.array(self.vertices, float).reshape(-1, 3)
+        for surface, triangles in zip(surfaces, triangulate(vertices, polygons), strict=True):
+            if surface.kind == _STRIP:
+                triangles = np.arange(max(len(surface.corners) - 2, 0))[:, None] + np.arange(3)
+            if len(triangles):
+                corners = [surface.corners[at] for at in triangles.ravel().tolist()]
+                self.triangles.setdefault(surface.material, []).extend(corners)
+
+    def _read_surface(self, lines: _Lines) -> _Ac3dSurface:
         word, rest = lines.words()
         if word != "SURF":
             raise ValueError(f"line {lines.number}: {word!r} where a SURF should be")
@@ -176,49 +198,7 @@ class _Ac3dObject:
         corners = lines.triples(int(rest))
         if any(not 0 <= index < len(self.vertices) for index, _, _ in corners):
             raise ValueError(f"line {lines.number}: refs to vertices that the object does not have")
-        if kind in _LINES:
-            return
-        if kind == _STRIP:
-            triangles = [(start, start + 1, start + 2) for start in range(len(corners) - 2)]
-        else:
-            triangles = triangulate([self.vertices[int(index)] for index, _, _ in corners])
-        self.triangles.setdefault(material, []).extend(corners[at] for each in triangles for at in each)
-
-
-def triangulate(polygon: Sequence[tuple[float, float, float]]) -> list[tuple[int, int, int]]:
-    """Triangles, as indices of corners, that cover a polygon, which may be concave: ear clipping.
-
-    Where no corner that is left is an ear, as where the outline crosses itself, the next corner is cut off.
-    """
-    count = len(polygon)
-    if count <= 3:
-        return [(0, 1, 2)] if count == 3 else []
-    normal = [0.0, 0.0, 0.0]  # Newell's
-    for a, b in zip(polygon, [*polygon[1:], polygon[0]], strict=True):
-        for axis in range(3):
-            one, two = (axis + 1) % 3, (axis + 2) % 3
-            normal[axis] += (a[one] - b[one]) * (a[two] + b[two])
-    axis = max(range(3), key=lambda each: abs(normal[each]))
-    one, two = (axis + 1) % 3, (axis + 2) % 3
-    if normal[axis] < 0:  # counter-clockwise in the two axes that are left
-        one, two = two, one
-    x, y = [corner[one] for corner in polygon], [corner[two] for corner in polygon]
-
-    def area(a: int, b: int, c: int) -> float:
-        return (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
-
-    def is_ear(a: int, b: int, c: int) -> bool:
-        return area(a, b, c) > 0 and not any(
-            area(a, b, p) > 0 and area(b, c, p) > 0 and area(c, a, p) > 0 for p in rest if p not in (a, b, c)
-        )
-
-    rest, triangles = list(range(count)), []
-    while len(rest) > 3:
-        at = range(len(rest))
-        ear = next((i for i in at if is_ear(rest[i - 1], rest[i], rest[(i + 1) % len(rest)])), 0)
-        triangles.append((rest[ear - 1], rest[ear], rest[(ear + 1) % len(rest)]))
-        del rest[ear]
-    return [*triangles, (rest[0], rest[1], rest[2])]
+        return _Ac3dSurface(kind, material, corners)
 
 
 def read_md2(content: bytes, file_content: FileContent) -> trimesh.Scene:

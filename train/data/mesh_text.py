@@ -4,26 +4,59 @@ from __future__ import annotations
 
 import importlib.util
 import io
-import itertools
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import trimesh
+from trimesh.visual import ColorVisuals
+
+from train.data.polygons import clip_concave, triangulate
 
 # Options of a texture in an MTL file, and how many values each takes at most; those of -o, -s and -t are numbers.
 _OPTIONS = {
     "-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-mm": 2, "-bm": 1, "-o": 3, "-s": 3, "-t": 3, "-texres": 1,
     "-boost": 1, "-imfchan": 1, "-type": 1,
 }  # fmt: skip
+_POLYGON = re.compile(rb"^f((?:[ \t]+-?\d+(?:/-?\d*){0,2}){4,})[ \t]*$", re.MULTILINE)
+"""A face of an OBJ file with more than three corners."""
+
+_VERTEX = re.compile(rb"^v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
 _DRACO = "KHR_draco_mesh_compression"
 
 
 def read_obj(content: bytes, files: Any) -> trimesh.Scene:
     """Reads an OBJ file in any encoding: only names and comments can have letters that are not ASCII."""
-    return _load(_as_utf8(content), "obj", files)
+    return _load(_in_triangles(_as_utf8(content)), "obj", files)
+
+
+def _in_triangles(content: bytes) -> bytes:
+    """An OBJ file whose concave faces are written as triangles; the others are left to trimesh, which makes fans."""
+    content = content.replace(b"\r\n", b"\n").replace(b"\\\n", b"")
+    places = [face.span(1) for face in _POLYGON.finditer(content)]
+    if not places:
+        return content
+    numbers = (float(number) for vertex in _VERTEX.finditer(content) for number in vertex.groups())
+    try:
+        vertices = np.fromiter(numbers, float).reshape(-1, 3)
+    except ValueError:  # trimesh says what is wrong with them
+        return content
+    faces = [content[start:end] for start, end in places]
+    sizes = np.array([len(face.split()) for face in faces])
+    indices = np.array(re.sub(rb"/\S*", b"", b"".join(faces)).split()).astype(int)
+    # Negative numbers count back from the last vertex that is written before the face.
+    written = np.fromiter((vertex.start() for vertex in _VERTEX.finditer(content)), int)
+    written_before = np.searchsorted(written, [start for start, _ in places])
+    indices = np.where(indices > 0, indices - 1, indices + np.repeat(written_before, sizes))
+    pieces, at = [], 0
+    for number, triangles in sorted(clip_concave(vertices, indices, sizes).items()):
+        (start, end), corners = places[number], faces[number].split()
+        lines = (b" " + b" ".join(corners[corner] for corner in triangle) for triangle in triangles.tolist())
+        pieces += [content[at:start], b"\nf".join(lines)]
+        at = end
+    return b"".join([*pieces, content[at:]])
 
 
 def clean_mtl(content: bytes) -> bytes:
@@ -65,7 +98,45 @@ def read_ply(content: bytes, files: Any) -> trimesh.Scene:
         header = re.sub(
             rb"(?m)^(property .*\b)(s|t|u|v|texture_u|texture_v|texcoord)[ \t]*(\r?)$", rb"\1_\2\3", header
         )
-    return _load(header + end + body, "ply", files)
+    scene = _load(header + end + body, "ply", files)
+    for mesh in scene.geometry.values():
+        if isinstance(mesh, trimesh.Trimesh):
+            _cover_polygons(mesh)
+    return scene
+
+
+def _cover_polygons(mesh: trimesh.Trimesh) -> None:
+    """Replaces the fans that trimesh made of a PLY file's concave polygons; colours go with their faces."""
+    polygons = _polygons_of_ply(mesh)
+    sizes = np.array([len(polygon) for polygon in polygons], int)
+    if (sizes == 3).all():
+        return
+    # A number for each corner of each polygon, and what trimesh makes of these: so it is known which corner of the
+    # file became which vertex of the mesh, and to which polygon a triangle belongs.
+    starts = np.cumsum(sizes) - sizes
+    fans = trimesh.geometry.triangulate_quads(np.split(np.arange(sizes.sum()), starts[1:]))
+    if fans.shape != mesh.faces.shape:
+        return
+    vertex = np.zeros(sizes.sum(), int)
+    vertex[fans] = mesh.faces
+    owner = np.repeat(np.arange(len(sizes)), sizes)
+    clipped = clip_concave(mesh.vertices, vertex, sizes)
+    kept = fans[~np.isin(owner[fans[:, 0]], list(clipped))]
+    corners = np.concatenate([kept, *(starts[number] + found for number, found in clipped.items())])
+    visual = mesh.visual
+    mesh.faces = vertex[corners]
+    if isinstance(visual, ColorVisuals) and visual.kind == "face" and len(visual.face_colors) == len(sizes):
+        mesh.visual = ColorVisuals(mesh, face_colors=visual.face_colors[owner[corners[:, 0]]])
+
+
+def _polygons_of_ply(mesh: trimesh.Trimesh) -> np.ndarray | Sequence[np.ndarray]:
+    """The faces as the file has them, with the file's own numbers of vertices."""
+    faces = mesh.metadata.get("_ply_raw", {}).get("face", {}).get("data")
+    names = faces.dtype.names if isinstance(faces, np.ndarray) else faces
+    name = next((each for each in ("vertex_indices", "vertex_index") if each in (names or ())), None)
+    if name is None:
+        return []
+    return faces[name]["f1"] if isinstance(faces, np.ndarray) else faces[name]
 
 
 def read_off(content: bytes, files: Any) -> trimesh.Scene:
@@ -82,12 +153,11 @@ def read_off(content: bytes, files: Any) -> trimesh.Scene:
     if len(of_faces) < face_count:
         raise ValueError("the file ends early")
     vertices = np.array([line[:3] for line in of_vertices], float)
+    polygons = [[int(corner) for corner in line[1 : 1 + int(line[0])]] for line in of_faces]
     faces, colours = [], []
-    for count, *rest in of_faces:
-        corners, colour = rest[: int(count)], rest[int(count) :]
-        for second, third in itertools.pairwise(corners[1:]):
-            faces.append([corners[0], second, third])
-            colours.append(colour)
+    for line, polygon, triangles in zip(of_faces, polygons, triangulate(vertices, polygons), strict=True):
+        faces += [[polygon[corner] for corner in triangle] for triangle in triangles.tolist()]
+        colours += [line[1 + len(polygon) :]] * len(triangles)
     given: dict[str, Any] = {}
     if match[1]:
         given["vertex_colors"] = _colours([line[3:] for line in of_vertices])
