@@ -1,8 +1,8 @@
 """`python -m benchmarks`: times of every op and its peers, run in turns, medians; writes benchmarks/results/.
 
 Parts: races (with each op's extra memory), memory (its growth), dispatch (of torch operators), sweep (over the number
-of points), train (a training step). `publish` puts the tables of the last run into README.md and docs/performance.md.
-`gpu` measures a GPU instead, within --minutes, and tests the kernels on it.
+of points), lone (large clouds on one thread and on all), train (a training step). `publish` puts the tables of the last
+run into README.md and docs/performance.md. `gpu` measures a GPU instead, within --minutes, and tests the kernels on it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch is imported
 
-PARTS = ("races", "memory", "dispatch", "sweep", "train")
+PARTS = ("races", "memory", "dispatch", "sweep", "lone", "train")
 
 
 def main() -> int:
@@ -85,7 +85,7 @@ def _measure(parts: list[str], arguments: argparse.Namespace) -> int:
 
 
 def _rows(part: str, arguments: argparse.Namespace, failures: list[str]) -> Iterator[dict[str, Any]]:
-    from benchmarks import dispatch, memory, sweep
+    from benchmarks import dispatch, lone, memory, sweep
 
     quick = arguments.quick
     if part == "races":
@@ -96,6 +96,8 @@ def _rows(part: str, arguments: argparse.Namespace, failures: list[str]) -> Iter
         yield from dispatch.measure()
     elif part == "sweep":
         yield from sweep.measure(longest=0.5 if quick else 4.0)
+    elif part == "lone":
+        yield from lone.measure(seconds=0.0 if quick else 1.0)
     elif part == "train":
         try:
             from benchmarks import training

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from benchmarks.lone import POINTS
 from benchmarks.saved import title
 from benchmarks.sweep import exponent
 from benchmarks.targets import targets
@@ -35,6 +36,8 @@ def page(results: dict[str, Any]) -> str:
         parts += ["## Beside other libraries", race_table(rows)]
     if rows := results.get("sweep"):
         parts += ["## How times grow", sweep_table(rows)]
+    if rows := results.get("lone"):
+        parts += ["## Lone large clouds", lone_table(rows)]
     if rows := results.get("memory"):
         parts += ["## Peak extra memory", memory_table(rows)]
     if rows := results.get("dispatch"):
@@ -103,6 +106,16 @@ def sweep_table(rows: Rows) -> str:
     names = [f"{n // 1024}k" if n < 2**20 else f"{n // 2**20}M" for n in sizes]
     return "Milliseconds per cloud or pair, by N.\n\n" + markdown(
         ["op", "B", *names, "exponent from 16k"], lines
+    )
+
+
+def lone_table(rows: Rows) -> str:
+    lines = [
+        [r["op"], f"{r['one_ms']:.3g}", f"{r['all_ms']:.3g}", f"{r['one_ms'] / r['all_ms']:.2f}x"]
+        for r in rows
+    ]
+    return f"Clouds and maps of about {POINTS:,} points or pixels.\n\n" + markdown(
+        ["op", "one thread, ms", f"{rows[0]['threads']} threads, ms", "faster"], lines
     )
 
 

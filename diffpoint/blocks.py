@@ -34,6 +34,11 @@ class Blocks(NamedTuple):
         """`boxes` in rows of 16, for kernels that load whole vectors."""
         return self.boxes.view(*self.boxes.shape[:2], -1, LANES)
 
+    @property
+    def group_lanes(self) -> Tensor:
+        """`groups`, likewise."""
+        return self.groups.view(*self.groups.shape[:2], -1, LANES)
+
 
 def sort_into_blocks(points: Tensor, lengths: Tensor) -> Blocks:
     """Sort clouds (B, N, 3) of the given lengths (B,); O(N) time and memory."""

@@ -378,4 +378,6 @@ def add_nearest_gradients(
 ) -> None:
     """Adds the gradients of squared distances from each point of `a` to one or several neighbours, in order."""
     if a.numel() and b.numel():
-        _bridge.launch("nearest", "backward", a.dtype, a, b, index, grad_squared_distance, grad_a, grad_b)
+        inputs = (x.reshape(-1) for x in (a, b, index, grad_squared_distance))
+        outputs = grad_a.view(-1), grad_b.view(-1)
+        _bridge.launch("nearest", "backward", a.dtype, *inputs, *outputs, a.shape[1], b.shape[1])

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from diffpoint import _bridge, _checks
+from diffpoint._parts import sum_of_parts, summed_parts
 from diffpoint.camera import PinholeCamera, PointSets, Projection, Views, check_views
 
 _TILE = 8  # as in kernels/reproject.py
@@ -162,22 +163,23 @@ def _project_backward(
     points: Tensor, projection: Tensor, grad_pixels: Tensor, grad_depth: Tensor
 ) -> tuple[Tensor, Tensor]:
     views, count = projection.shape[1], points.shape[1]
+    parts = summed_parts(count)
     if points.numel() == 0 or projection.numel() == 0:
         return points.new_zeros(points.shape), projection.new_zeros(projection.shape)
     grad_points = points.new_empty(points.shape)
-    grad_projection = projection.new_empty(projection.shape)
+    grad_projection = projection.new_empty((*projection.shape[:2], parts, 3, 4))
     (pixels_flat, pixels_step), (depth_flat, depth_step) = _walk(grad_pixels), _walk(grad_depth)
     inputs = points.reshape(-1), projection.reshape(-1), pixels_flat, depth_flat
     outputs = grad_points.view(-1), grad_projection.view(-1)
-    sizes = pixels_step, depth_step, views, count
+    sizes = pixels_step, depth_step, views, parts, count
     _bridge.launch("reproject", "project_backward", points.dtype, *inputs, *outputs, *sizes)
-    return grad_points, grad_projection
+    return grad_points, sum_of_parts(grad_projection, 2)
 
 
 def _walk(gradient: Tensor) -> tuple[Tensor, int]:
     """A flat tensor and its step: 1, or 0 for an expanded number (the gradient of a sum), of which one tile is made."""
     if any(gradient.stride()):
-        return gradient.reshape(-1), 1
+        return gradient.contiguous().view(-1), 1  # `reshape` would keep the strides of a slice
     return gradient.as_strided((3 * _TILE,), (0,)).contiguous(), 0
 
 
@@ -305,12 +307,14 @@ def _reproject_backward(
     grad_pixels: Tensor,
     grad_seen: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    inputs = depth, back_projection, projection
-    grad_depth, grad_back_projection, grad_projection = (x.new_empty(x.shape) for x in inputs)
+    batch, views, height, width = depth.shape
+    parts = summed_parts(height * width)
+    grad_depth = depth.new_empty(depth.shape)
+    grad_back_projection, grad_projection = (depth.new_empty((batch, views, parts, 3, 4)) for _ in range(2))
     if depth.numel():
         gradients, steps = zip(*(_walk(g) for g in (grad_points, grad_pixels, grad_seen)), strict=True)
         outputs = grad_depth.view(-1), grad_back_projection.view(-1), grad_projection.view(-1)
-        flat = [x.reshape(-1) for x in inputs]
-        sizes = *steps, *depth.shape[2:]
-        _bridge.launch("reproject", "reproject_backward", depth.dtype, *flat, *gradients, *outputs, *sizes)
-    return grad_depth, grad_back_projection, grad_projection
+        inputs = (x.reshape(-1) for x in (depth, back_projection, projection))
+        sizes = *steps, parts, height, width
+        _bridge.launch("reproject", "reproject_backward", depth.dtype, *inputs, *gradients, *outputs, *sizes)
+    return grad_depth, sum_of_parts(grad_back_projection, 2), sum_of_parts(grad_projection, 2)

@@ -114,15 +114,11 @@ def _farthest(
         )
         return chosen
     blocks = sort_into_blocks(points, lengths)
-    distance = _unset_distance(points, lengths, blocks.points.shape[1])
-    box_farthest = points.new_empty((batch, blocks.boxes.shape[2]))
-    box_point = torch.zeros(box_farthest.shape, dtype=torch.int32)
-    scratch = distance.view(batch, -1, _LANES), distance, box_farthest, box_farthest.view(batch, -1, _LANES)
-    sorted_points = blocks.points, *lanes(blocks.points), blocks.order, blocks.box_lanes
+    sets = blocks.points, *lanes(blocks.points), blocks.order, blocks.box_lanes, blocks.group_lanes
+    distance = _unset_distance(points, lengths, blocks.points.shape[1]).view(batch, -1, _LANES)
+    largest = (points.new_empty((batch, *x.shape[2:])) for x in (blocks.box_lanes, blocks.group_lanes))
     chosen_by = counts, starts, chosen
-    _bridge.launch(
-        "sampling", "farthest_blocks", points.dtype, *sorted_points, *scratch, box_point, *chosen_by
-    )
+    _bridge.launch("sampling", "farthest_blocks", points.dtype, *sets, distance, *largest, *chosen_by)
     return chosen
 
 

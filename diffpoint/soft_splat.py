@@ -10,6 +10,7 @@ from torch import Tensor
 
 from diffpoint import _bridge, _checks
 from diffpoint._common import least_fade
+from diffpoint._parts import gathered_parts
 from diffpoint.camera import PinholeCamera
 from diffpoint.reproject import project
 
@@ -173,12 +174,13 @@ def _soft_splat_backward(
     radius: float,
     softness: float,
 ) -> tuple[Tensor, Tensor]:
-    _, views, count = point_depth.shape
+    batch, views, count = point_depth.shape
     grad_pixels, grad_point_depth = pixels.new_empty(pixels.shape), point_depth.new_empty(point_depth.shape)
     if point_depth.numel():
         inputs = pixels.reshape(-1), point_depth.reshape(-1), lengths
         maps = (m.reshape(-1) for m in (depth, nearest, weight, grad_depth, grad_coverage))
         outputs = grad_pixels.view(-1), grad_point_depth.view(-1)
-        sizes = views, count, *depth.shape[2:], radius, softness, least_fade(depth, radius)
+        parts = gathered_parts(batch * views, count)
+        sizes = views, parts, count, *depth.shape[2:], radius, softness, least_fade(depth, radius)
         _bridge.launch("soft_splat", "backward", point_depth.dtype, *inputs, *maps, *outputs, *sizes)
     return grad_pixels, grad_point_depth

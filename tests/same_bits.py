@@ -9,6 +9,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,6 +23,9 @@ CAMERAS = dp.PinholeCamera.look_at(
 OTHERS = dp.PinholeCamera.look_at(
     torch.tensor([[0.3, 0.2, -2], [2, -0.3, 0.4]]), focal_px=55.0, height=29, width=31
 )
+
+
+LARGE = CAMERAS.resize(250, 201)  # lone maps and clouds of such a size are divided among the threads
 
 
 def clouds(count: int, points: int, seed: int) -> Tensor:
@@ -46,9 +50,9 @@ def splatted(count: int, size: int, seen_by: dp.PinholeCamera) -> list[Tensor]:
     return out
 
 
-def maps() -> tuple[Tensor, dp.PinholeCamera]:
-    cameras = leaf_cameras(CAMERAS)
-    return dp.splat_depth(clouds(3, 500, 9), CAMERAS, radius=1.0).depth.requires_grad_(), cameras
+def maps(seen_by: dp.PinholeCamera = CAMERAS, count: int = 3) -> tuple[Tensor, dp.PinholeCamera]:
+    depth = dp.splat_depth(clouds(count, 500, 9), seen_by, radius=1.0).depth
+    return depth.requires_grad_(), leaf_cameras(seen_by)
 
 
 def with_gradients(leaves: Iterable[Tensor], *outputs: Tensor) -> list[Tensor]:
@@ -57,22 +61,22 @@ def with_gradients(leaves: Iterable[Tensor], *outputs: Tensor) -> list[Tensor]:
     return [*outputs, *torch.autograd.grad(total, leaves)]
 
 
-def unprojected() -> list[Tensor]:
-    depth, cameras = maps()
+def unprojected(*scene: Any) -> list[Tensor]:
+    depth, cameras = maps(*scene)
     points, lengths = dp.unproject(depth, cameras)
     return [lengths, *with_gradients((depth, cameras.K, cameras.cam_from_world), points)]
 
 
-def reprojected() -> list[Tensor]:
-    depth, cameras = maps()
-    targets = leaf_cameras(OTHERS)
+def reprojected(targets: dp.PinholeCamera, *scene: Any) -> list[Tensor]:
+    depth, cameras = maps(*scene)
+    targets = leaf_cameras(targets)
     seen = dp.reproject(depth, cameras, targets)
     leaves = depth, cameras.K, cameras.cam_from_world, targets.K, targets.cam_from_world
     return [seen.valid, *with_gradients(leaves, seen.points, seen.pixels, seen.depth)]
 
 
-def projected() -> list[Tensor]:
-    points, cameras = clouds(3, 700, 1).requires_grad_(), leaf_cameras(CAMERAS)
+def projected(count: int, size: int) -> list[Tensor]:
+    points, cameras = clouds(count, size, 1).requires_grad_(), leaf_cameras(CAMERAS)
     return with_gradients((points, cameras.K, cameras.cam_from_world), *dp.project(points, cameras))
 
 
@@ -101,18 +105,18 @@ def diversity() -> list[Tensor]:
 OPS: dict[str, Callable[[], list[Tensor]]] = {
     "nearest": lambda: [
         t
-        for sizes in ((5, 300, 400), (2, 3000, 3100))
+        for sizes in ((5, 300, 400), (2, 3000, 3100), (1, 40_000, 41_000))
         for t in both(lambda a, b: dp.nearest(a, b)[:1], *sizes)
     ],
     "knn": lambda: [
         t
-        for sizes in ((5, 300, 400), (2, 3000, 3100))
+        for sizes in ((5, 300, 400), (2, 3000, 3100), (1, 40_000, 41_000))
         for t in both(lambda a, b: dp.knn(a, b, 8)[:1], *sizes)
     ],
     "f_score": lambda: [*dp.f_score(clouds(5, 300, 8), clouds(5, 400, 9), 0.05)],
     "chamfer_distance": lambda: [
         t
-        for sizes in ((1, 900, 700), (5, 300, 400), (2, 3000, 3100))
+        for sizes in ((1, 900, 700), (5, 300, 400), (2, 3000, 3100), (1, 40_000, 41_000))
         for t in both(lambda a, b: dp.chamfer_distance(a, b, squared=False), *sizes)
     ],
     "hausdorff_distance": lambda: both(lambda a, b: (dp.hausdorff_distance(a, b),), 5, 300, 400),
@@ -132,19 +136,24 @@ OPS: dict[str, Callable[[], list[Tensor]]] = {
     ],
     "approxmatch": lambda: both(lambda a, b: (dp.approxmatch(a, b),), 5, 300, 400),
     "farthest_point_sample": lambda: [
-        dp.farthest_point_sample(clouds(*size, 6), 60) for size in ((5, 300), (1, 3000), (2, 9000))
+        dp.farthest_point_sample(clouds(*size, 6), 60)
+        for size in ((5, 300), (1, 3000), (2, 9000), (1, 40_000))
     ],
     # The points of the last, a lone view, are shared out among the threads.
     "splat_depth": lambda: [*splatted(5, 300, CAMERAS), *splatted(1, 40_000, CAMERAS[:1])],
-    "sample_view": lambda: alone(lambda x: (dp.sample_view(x, dp.splat_depth(x, CAMERAS)).points,), 5, 300),
+    "sample_view": lambda: [
+        t
+        for size in ((5, 300), (1, 40_000))
+        for t in alone(lambda x: (dp.sample_view(x, dp.splat_depth(x, CAMERAS)).points,), *size)
+    ],
     "visible_points": lambda: [
         dp.visible_points(clouds(*size, 7), CAMERAS, method=method)
         for method in METHODS
         for size in ((5, 300), (1, 5000))
     ],
-    "project": projected,
-    "unproject": unprojected,
-    "reproject": reprojected,
+    "project": lambda: [*projected(3, 700), *projected(1, 50_000)],
+    "unproject": lambda: [*unprojected(), *unprojected(LARGE[:1], 1)],
+    "reproject": lambda: [*reprojected(OTHERS), *reprojected(LARGE[1:], LARGE[:1], 1)],
     "front_constraint": lambda: loss(lambda x, depth: dp.front_constraint(x, CAMERAS, depth)),
     "front_terms": lambda: loss(
         lambda x, depth: dp.front_terms(x, CAMERAS, depth, distance="emd", visibility="horizon").loss
@@ -154,7 +163,7 @@ OPS: dict[str, Callable[[], list[Tensor]]] = {
         lambda x, depth: dp.projection_loss(x, CAMERAS, depth, logits=x[..., 0], mask_weight=0.1, upsample=2)
     ),
     "soft_splat": lambda: [
-        t for size in ((5, 300), (1, 5000)) for t in alone(lambda x: dp.soft_splat(x, CAMERAS), *size)
+        t for size in ((5, 300), (1, 40_000)) for t in alone(lambda x: dp.soft_splat(x, CAMERAS), *size)
     ],
     "soft_projection_loss": lambda: loss(lambda x, depth: dp.soft_projection_loss(x, CAMERAS, depth)),
     "diversity_loss": diversity,

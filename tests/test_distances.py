@@ -328,6 +328,17 @@ def test_farthest_points_of_large_and_small_clouds_come_in_the_same_order(monkey
         assert torch.equal(every_distance, with_boxes)
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("steps", [1e6, 6])
+def test_farthest_points_of_a_scan_come_in_the_plain_order(monkeypatch, dtype, steps):
+    """Of more boxes than two vectors of groups; on a lattice most steps are ties."""
+    points = (random(2, 36_000, 3, dtype=dtype) * steps).round()
+    lengths = torch.tensor([36_000, 33_001])
+    with_boxes = dp.farthest_point_sample(points, 400, start=7, lengths=lengths)
+    monkeypatch.setattr(sampling, "_LARGE", 2**30)
+    assert torch.equal(with_boxes, dp.farthest_point_sample(points, 400, start=7, lengths=lengths))
+
+
 @pytest.mark.parametrize("large", [False, True])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_no_point_is_chosen_twice(monkeypatch, large, dtype):

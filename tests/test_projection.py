@@ -39,6 +39,24 @@ def test_only_the_soft_loss_moves_points_sideways():
     assert soft[..., :2].norm() / soft.norm() > 0.2
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_lone_cloud_in_parts_has_the_soft_gradients_of_one_among_many(dtype):
+    """A lone cloud is divided among the threads; of eighty each thread takes whole ones."""
+    cloud = torch.rand(1, 4500, 3, generator=torch.Generator().manual_seed(0), dtype=dtype) - 0.5
+    lengths = torch.tensor([4300])
+
+    def gradient(copies: int) -> torch.Tensor:
+        points = cloud.repeat(copies, 1, 1).requires_grad_()
+        soft = dp.soft_splat(points, camera(dtype)[0], lengths=lengths.expand(copies))
+        (found,) = torch.autograd.grad((soft.mask * soft.depth.clamp(max=9)).sum(), points)
+        return found
+
+    alone = gradient(1)
+    assert (alone[0, :4300].abs().sum(-1) > 0).float().mean() > 0.9
+    assert (alone[0, 4300:] == 0).all()
+    assert torch.equal(gradient(80), alone.expand(80, -1, -1))
+
+
 @pytest.mark.parametrize("at", [(-0.48, -0.1), (0.49, 0.3), (0.0, -0.49), (-0.55, 0.0), (0.52, -0.52)])
 def test_the_soft_loss_moves_points_towards_the_silhouette(at):
     """In the middle of the background, at the frame's edge, and just beyond it."""

@@ -50,6 +50,11 @@ def build(real):
                 total[view] = sum_of_depths
 
     @ti.func
+    def part_size(count, parts):
+        """Points of a part: whole tiles."""
+        return ((count + parts - 1) // parts + TILE - 1) // TILE * TILE
+
+    @ti.func
     def pull_back(m: ti.template(), x, y, z, g_u, g_v, g_d):
         """Gradients to the rows times (x, y, z, 1), which are (u d, v d, d); of one point or of a vector of them."""
         d = m[8] * x + m[9] * y + m[10] * z + m[11]
@@ -72,17 +77,23 @@ def build(real):
         pixels_step: ti.i32,
         depth_step: ti.i32,
         views: ti.i32,
+        parts: ti.i32,
         count: ti.i32,
         spread: ti.i32,
     ):
-        """One thread per cloud handles all its views. (`a[i] += x` would be a slow atomic addition.)
+        """One thread per part of a cloud handles all its views. (`a[i] += x` would be a slow atomic addition.)
 
-        With a step of 0 the gradients of one tile are used for all.
+        With a step of 0 the gradients of one tile are used for all. `grad_projection` (B, V, parts, 3, 4) receives the
+        sums of each part.
         """
-        tiles = count // TILE
-        for step in range(points.shape[0] // (3 * count) * spread):
+        share = part_size(count, parts)
+        for step in range(points.shape[0] // (3 * count) * parts * spread):
             if step % spread == 0:
-                cloud = step // spread
+                cloud = step // spread // parts
+                part = step // spread % parts
+                start = ti.min(part * share, count)
+                stop = ti.min(start + share, count)
+                tiles = (stop - start) // TILE
                 for view in range(cloud * views, cloud * views + views):
                     first = view == cloud * views
                     m = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
@@ -90,8 +101,8 @@ def build(real):
                     x0 = ti.Vector([real(0.0) for _ in ti.static(range(TILE))])
                     y0, z0, w0, x1, y1, z1, w1, x2, y2, z2, w2 = x0, x0, x0, x0, x0, x0, x0, x0, x0, x0, x0
                     for t in range(tiles):
-                        source = (cloud * count + t * TILE) * 3
-                        target = view * count + t * TILE
+                        source = (cloud * count + start + t * TILE) * 3
+                        target = view * count + start + t * TILE
                         x = ti.Vector([points[source + 3 * s] for s in ti.static(range(TILE))])
                         y = ti.Vector([points[source + 3 * s + 1] for s in ti.static(range(TILE))])
                         z = ti.Vector([points[source + 3 * s + 2] for s in ti.static(range(TILE))])
@@ -137,7 +148,7 @@ def build(real):
                             x2.sum(), y2.sum(), z2.sum(), w2.sum(),
                         ]
                     )  # fmt: skip
-                    for i in range(tiles * TILE, count):
+                    for i in range(start + tiles * TILE, stop):
                         source = (cloud * count + i) * 3
                         target = view * count + i
                         p = ti.Vector([points[source], points[source + 1], points[source + 2], real(1.0)])
@@ -158,7 +169,7 @@ def build(real):
                             g = g0 * m[k] + g1 * m[4 + k] + g2 * m[8 + k]
                             grad_points[source + k] = ti.select(first, g, grad_points[source + k] + g)
                     for e in ti.static(range(12)):
-                        grad_projection[view * 12 + e] = total[e]
+                        grad_projection[(view * parts + part) * 12 + e] = total[e]
 
     @ti.kernel
     def unproject(
@@ -366,24 +377,29 @@ def build(real):
         points_step: ti.i32,
         pixels_step: ti.i32,
         seen_step: ti.i32,
+        parts: ti.i32,
         height: ti.i32,
         width: ti.i32,
         spread: ti.i32,
     ):
-        """With a step of 0 the gradients of one tile are used for all.
+        """One thread per part of a map, some rows of it; the matrices' gradients (B, V, parts, 3, 4) receive its sums.
 
+        With a step of 0 the gradients of one tile are used for all.
         Both matrices' gradients are sums of gradients times (u d, v d, d, 1): of those to the world points, and of
         those to the target's rows, whose (x, y, z, 1) are `back_projection` times the same four.
         """
         tiles = width // TILE
-        for step in range(projection.shape[0] // 12 * spread):
+        share = (height + parts - 1) // parts
+        for step in range(projection.shape[0] // 12 * parts * spread):
             if step % spread == 0:
-                view = step // spread
+                at_part = step // spread
+                view = at_part // parts
+                first = ti.min(at_part % parts * share, height)
                 b = ti.Vector([back_projection[view * 12 + e] for e in ti.static(range(12))])
                 m = ti.Vector([projection[view * 12 + e] for e in ti.static(range(12))])
                 world = ti.Vector([real(0.0) for _ in ti.static(range(12))])
                 image = ti.Vector([real(0.0) for _ in ti.static(range(12))])
-                for row in range(height):
+                for row in range(first, ti.min(first + share, height)):
                     v = ti.cast(row, real) + real(0.5)
                     u = ti.Vector([ti.cast(s, real) + real(0.5) for s in ti.static(range(TILE))])
                     start = (view * height + row) * width
@@ -480,15 +496,15 @@ def build(real):
                         add_row(image, 4 * k, of_row, 3 * k + 9, v)
                 for k in ti.static(range(3)):
                     for e in ti.static(range(4)):
-                        grad_back_projection[view * 12 + 4 * k + e] = world[4 * k + e]
+                        grad_back_projection[at_part * 12 + 4 * k + e] = world[4 * k + e]
                     for e in ti.static(range(3)):
-                        grad_projection[view * 12 + 4 * k + e] = (
+                        grad_projection[at_part * 12 + 4 * k + e] = (
                             b[4 * e] * image[4 * k]
                             + b[4 * e + 1] * image[4 * k + 1]
                             + b[4 * e + 2] * image[4 * k + 2]
                             + b[4 * e + 3] * image[4 * k + 3]
                         )
-                    grad_projection[view * 12 + 4 * k + 3] = image[4 * k + 3]
+                    grad_projection[at_part * 12 + 4 * k + 3] = image[4 * k + 3]
 
     return SimpleNamespace(
         project=project,

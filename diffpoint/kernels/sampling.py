@@ -3,9 +3,8 @@
 from types import SimpleNamespace
 
 from diffpoint.kernels._backend import ti
-from diffpoint.kernels.blocks import BLOCK
+from diffpoint.kernels.blocks import BLOCK, LANES, ROWS
 
-LANES = 16
 PARTS = BLOCK // LANES  # vectors in a box
 
 
@@ -70,6 +69,57 @@ def build(real):
     boxes3 = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=3)
     orders2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
+    @ti.func
+    def reached(boxes: ti.template(), farthest: ti.template(), cloud, t, x, y, z):
+        """Bit s: box s of a row of 16 is no farther from (x, y, z) than the largest distance in it."""
+        here = ti.Vector([x, y, z])
+        gap = ti.Vector([real(0.0) for s in ti.static(range(LANES))])
+        for axis in ti.static(range(3)):
+            below = boxes[cloud, axis, t] - here[axis]
+            above = here[axis] - boxes[cloud, axis + 3, t]
+            for s in ti.static(range(LANES)):
+                outside = ti.select(below[s] > above[s], below[s], above[s])
+                outside = ti.select(outside > 0, outside, real(0.0))
+                gap[s] += outside * outside
+        bits = 0
+        for s in ti.static(range(LANES)):
+            bits |= ti.select(gap[s] <= farthest[s], 1 << s, 0)
+        return bits
+
+    @ti.func
+    def places_of(values: ti.template(), value):
+        """Bit s: values[s] is `value`."""
+        bits = 0
+        for s in ti.static(range(LANES)):
+            bits |= ti.select(values[s] == value, 1 << s, 0)
+        return bits
+
+    @ti.func
+    def lowest(bits):
+        """The position of the lowest bit that is set."""
+        return ti.math.popcnt((bits & -bits) - 1)
+
+    @ti.func
+    def put(values: ti.template(), place, value):
+        """values[place] = value, in registers."""
+        for s in ti.static(range(LANES)):
+            values[s] = ti.select(place == s, value, values[s])
+
+    @ti.func
+    def raise_to(values: ti.template(), others: ti.template()):
+        for s in ti.static(range(LANES)):
+            values[s] = ti.select(others[s] > values[s], others[s], values[s])
+
+    @ti.func
+    def largest_of(values: ti.template()):
+        """In four steps: 15 comparisons one after the other would take longer."""
+        v8 = ti.Vector(
+            [ti.select(values[s + 8] > values[s], values[s + 8], values[s]) for s in ti.static(range(8))]
+        )
+        v4 = ti.Vector([ti.select(v8[s + 4] > v8[s], v8[s + 4], v8[s]) for s in ti.static(range(4))])
+        v2 = ti.Vector([ti.select(v4[s + 2] > v4[s], v4[s + 2], v4[s]) for s in ti.static(range(2))])
+        return ti.select(v2[1] > v2[0], v2[1], v2[0])
+
     @ti.kernel
     def farthest_blocks(
         points: points3,
@@ -77,23 +127,21 @@ def build(real):
         y_lanes: lanes2,
         z_lanes: lanes2,
         order: orders2,
-        box_lanes: boxes3,
+        boxes: boxes3,
+        groups: boxes3,
         distance: lanes2,
-        distance_of: scalars2,
-        box_farthest: scalars2,
-        box_farthest_lanes: lanes2,
-        box_point: orders2,
+        box_farthest: lanes2,
+        group_farthest: lanes2,
         counts: counts1,
         starts: counts1,
         chosen: indices2,
         spread: ti.i32,
     ):
-        """`points`, `order`, `box_lanes` as sorted by `blocks.sort`; `distance` and `distance_of` as above.
+        """`points`, `order`, `boxes` and `groups` as sorted by `blocks.sort`; `distance` as above.
 
-        A new point changes distances only in boxes that are nearer to it than the largest distance in them, and in its
-        own, which may be as near. In a tie
-        the lowest index before sorting is chosen, as in the plain algorithm: the first within a box, because points
-        keep their order there.
+        A new point changes distances only in boxes that are no farther from it than the largest distance in them, and
+        only groups that are no farther hold such boxes. In a tie the lowest index before sorting is chosen, as in the
+        plain algorithm: within a box the first, because points keep their order there.
         """
         for step in range(points.shape[0] * spread):
             if step % spread == 0:
@@ -102,77 +150,80 @@ def build(real):
                 for i in range(order.shape[1]):
                     if order[cloud, i] == starts[cloud]:
                         current = i
-                for box in range(box_farthest.shape[1]):
-                    box_farthest[cloud, box] = distance[cloud, box * PARTS].max()
+                for t in range(group_farthest.shape[1]):
+                    in_groups = ti.Vector([real(-1.0) for s in ti.static(range(LANES))])
+                    for row in range(t * LANES * ROWS, ti.min((t + 1) * LANES * ROWS, box_farthest.shape[1])):
+                        in_boxes = ti.Vector([real(-1.0) for s in ti.static(range(LANES))])
+                        for s in range(LANES):
+                            # Only the last box may be filled in part, from the front.
+                            put(in_boxes, s, distance[cloud, (row * LANES + s) * PARTS][0])
+                        box_farthest[cloud, row] = in_boxes
+                        if row % ROWS == 0:
+                            put(in_groups, row // ROWS - t * LANES, in_boxes[0])
+                    group_farthest[cloud, t] = in_groups
                 for k in range(ti.cast(counts[cloud], ti.i32)):
                     chosen[cloud, k] = order[cloud, current]
-                    distance_of[cloud, current] = real(-1.0)
+                    own = distance[cloud, current // LANES]
+                    put(own, current % LANES, real(-1.0))
+                    distance[cloud, current // LANES] = own
                     x = points[cloud, current, 0]
                     y = points[cloud, current, 1]
                     z = points[cloud, current, 2]
                     best_lanes = ti.Vector([real(-2.0) for s in ti.static(range(LANES))])
-                    tile_lanes = ti.Vector([0 for s in ti.static(range(LANES))])
-                    tied_lanes = ti.Vector([0 for s in ti.static(range(LANES))])
-                    for t in range(box_lanes.shape[2]):
-                        gap = ti.Vector([real(0.0) for s in ti.static(range(LANES))])
-                        for axis in ti.static(range(3)):
-                            here = points[cloud, current, axis]
-                            below = box_lanes[cloud, axis, t] - here
-                            above = here - box_lanes[cloud, axis + 3, t]
-                            for s in ti.static(range(LANES)):
-                                outside = ti.select(below[s] > above[s], below[s], above[s])
-                                outside = ti.select(outside > 0, outside, real(0.0))
-                                gap[s] += outside * outside
-                        farthest_lanes = box_farthest_lanes[cloud, t]
-                        reached = 0  # a bit for each box
-                        for s in ti.static(range(LANES)):
-                            reached |= ti.select(gap[s] <= farthest_lanes[s], 1 << s, 0)
-                        if reached != 0:
-                            while reached != 0:
-                                box = t * LANES + ti.math.popcnt((reached & -reached) - 1)
-                                reached &= reached - 1
-                                farthest_here = real(-1.0)
-                                point = 0
-                                for part in ti.static(range(PARTS)):
-                                    row = box * PARTS + part
-                                    dx = x_lanes[cloud, row] - x
-                                    dy = y_lanes[cloud, row] - y
-                                    dz = z_lanes[cloud, row] - z
-                                    to_current = dx * dx + dy * dy + dz * dz
-                                    nearest = distance[cloud, row]
-                                    for r in ti.static(range(LANES)):
-                                        nearest[r] = ti.select(
-                                            to_current[r] < nearest[r], to_current[r], nearest[r]
-                                        )
-                                    distance[cloud, row] = nearest
-                                    for r in ti.static(range(LANES)):
-                                        farther = nearest[r] > farthest_here
-                                        point = ti.select(farther, part * LANES + r, point)
-                                        farthest_here = ti.select(farther, nearest[r], farthest_here)
-                                box_farthest[cloud, box] = farthest_here
-                                box_point[cloud, box] = box * BLOCK + point
-                            farthest_lanes = box_farthest_lanes[cloud, t]
-                        for s in ti.static(range(LANES)):
-                            farther = farthest_lanes[s] > best_lanes[s]
-                            equal = farthest_lanes[s] == best_lanes[s]
-                            tied_lanes[s] = ti.select(farther, 0, ti.select(equal, 1, tied_lanes[s]))
-                            tile_lanes[s] = ti.select(farther, t, tile_lanes[s])
-                            best_lanes[s] = ti.select(farther, farthest_lanes[s], best_lanes[s])
-                    best = best_lanes[0]
-                    best_box = tile_lanes[0] * LANES
-                    tied = tied_lanes[0]
-                    for s in ti.static(range(1, LANES)):
-                        farther = best_lanes[s] > best
-                        equal = best_lanes[s] == best
-                        tied = ti.select(farther, tied_lanes[s], ti.select(equal, 1, tied))
-                        best_box = ti.select(farther, tile_lanes[s] * LANES + s, best_box)
-                        best = ti.select(farther, best_lanes[s], best)
-                    if tied != 0:
-                        for box in range(box_farthest.shape[1]):
-                            lower = (
-                                order[cloud, box_point[cloud, box]] < order[cloud, box_point[cloud, best_box]]
-                            )
-                            best_box = ti.select((box_farthest[cloud, box] == best) & lower, box, best_box)
-                    current = box_point[cloud, best_box]
+                    for t in range(groups.shape[2]):
+                        in_groups = group_farthest[cloud, t]
+                        group_bits = reached(groups, in_groups, cloud, t, x, y, z)
+                        while group_bits != 0:
+                            group = lowest(group_bits)
+                            group_bits &= group_bits - 1
+                            in_group = ti.Vector([real(-1.0) for s in ti.static(range(LANES))])
+                            for row in range((t * LANES + group) * ROWS, (t * LANES + group + 1) * ROWS):
+                                in_boxes = box_farthest[cloud, row]
+                                box_bits = reached(boxes, in_boxes, cloud, row, x, y, z)
+                                while box_bits != 0:
+                                    box = lowest(box_bits)
+                                    box_bits &= box_bits - 1
+                                    in_box = ti.Vector([real(-1.0) for s in ti.static(range(LANES))])
+                                    for part in ti.static(range(PARTS)):
+                                        at = (row * LANES + box) * PARTS + part
+                                        dx = x_lanes[cloud, at] - x
+                                        dy = y_lanes[cloud, at] - y
+                                        dz = z_lanes[cloud, at] - z
+                                        to_current = dx * dx + dy * dy + dz * dz
+                                        least = distance[cloud, at]
+                                        for s in ti.static(range(LANES)):
+                                            least[s] = ti.select(
+                                                to_current[s] < least[s], to_current[s], least[s]
+                                            )
+                                        distance[cloud, at] = least
+                                        raise_to(in_box, least)
+                                    put(in_boxes, box, largest_of(in_box))
+                                box_farthest[cloud, row] = in_boxes
+                                raise_to(in_group, in_boxes)
+                            put(in_groups, group, largest_of(in_group))
+                        group_farthest[cloud, t] = in_groups
+                        raise_to(best_lanes, in_groups)
+                    best = largest_of(best_lanes)
+                    first = 2**31 - 1
+                    for t in range(groups.shape[2]):
+                        in_groups = group_farthest[cloud, t]
+                        group_bits = places_of(in_groups, best)
+                        while group_bits != 0:
+                            group = t * LANES + lowest(group_bits)
+                            group_bits &= group_bits - 1
+                            for row in range(group * ROWS, (group + 1) * ROWS):
+                                in_boxes = box_farthest[cloud, row]
+                                box_bits = places_of(in_boxes, best)
+                                while box_bits != 0:
+                                    box = row * LANES + lowest(box_bits)
+                                    box_bits &= box_bits - 1
+                                    point_bits = 0
+                                    for part in ti.static(range(PARTS)):
+                                        of_points = distance[cloud, box * PARTS + part]
+                                        point_bits |= places_of(of_points, best) << (part * LANES)
+                                    candidate = box * BLOCK + lowest(point_bits)
+                                    index = order[cloud, candidate]
+                                    current = ti.select(index < first, candidate, current)
+                                    first = ti.min(index, first)
 
     return SimpleNamespace(farthest=farthest, farthest_blocks=farthest_blocks)

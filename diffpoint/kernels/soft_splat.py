@@ -102,6 +102,7 @@ def build(real):
         grad_pixels: reals,
         grad_point_depth: reals,
         views: ti.i32,
+        parts: ti.i32,
         count: ti.i32,
         height: ti.i32,
         width: ti.i32,
@@ -110,20 +111,23 @@ def build(real):
         least: real,
         spread: ti.i32,
     ):
-        """One thread per view gathers from the pixels of its points."""
+        """One thread per part of a view's points gathers from the pixels of each."""
         zero = real(0.0)
         one = real(1.0)
         size = ti.Vector([ti.cast(height, real), ti.cast(width, real)])
-        for step in range(point_depth.shape[0] // count * spread):
+        part_size = (count + parts - 1) // parts
+        for step in range(point_depth.shape[0] // count * parts * spread):
             if step % spread == 0:
-                view = step // spread
+                view = step // spread // parts
                 start = view * height * width
-                stop = view * count + ti.cast(lengths[view // views], ti.i32)
-                for i in range(stop, (view + 1) * count):
+                first = ti.min(step // spread % parts * part_size, count)
+                last = ti.min(first + part_size, count)
+                length = ti.max(first, ti.min(last, ti.cast(lengths[view // views], ti.i32)))
+                for i in range(view * count + length, view * count + last):
                     grad_pixels[2 * i] = zero
                     grad_pixels[2 * i + 1] = zero
                     grad_point_depth[i] = zero
-                for i in range(view * count, stop):
+                for i in range(view * count + first, view * count + length):
                     u = pixels[2 * i]
                     v = pixels[2 * i + 1]
                     d = point_depth[i]
