@@ -230,7 +230,7 @@ def test_gradients_of_a_large_map_in_parts_are_those_of_its_rows(dtype, height):
         leaf = torch.full_like(depth, torch.inf)
         leaf[..., rows, :] = depth[..., rows, :]
         matrices = [m.clone().requires_grad_() for c in (source, target) for m in (c.K, c.cam_from_world)]
-        there, back = (dp.PinholeCamera(*matrices[i : i + 2], *size) for i in (0, 2))
+        there, back = (dp.PinholeCamera(matrices[i], matrices[i + 1], height, width) for i in (0, 2))
         seen = dp.reproject(leaf.requires_grad_(), there, back)
         outputs = torch.cat((seen.points, seen.pixels, seen.depth[..., None]), -1)
         total = torch.where(torch.isfinite(outputs), outputs * weight, 0.0).sum()
