@@ -106,3 +106,15 @@ def test_the_generators_output_layers_make_its_outputs(output_head: str) -> None
     predicted = generator.predict(torch.rand(1, 3, 48, 64), torch.randn(1, 1, generator.code_dim))
     outputs = predicted.points if predicted.latents is None else predicted.latents
     assert (outputs == 0.25).all()
+
+
+def test_the_momentum_of_dead_units_does_not_become_denormal() -> None:
+    """Processors are slow with denormal numbers, and half of a network may be dead."""
+    layer = nn.Linear(6, 4)
+    optimiser = Muon(layer, output_layers=[])
+    for step in range(2000):
+        layer.weight.grad = torch.ones(4, 6)
+        layer.weight.grad[:2] *= float(step == 0)
+        optimiser.step()
+    momentum = optimiser.state[layer.weight]["momentum"]
+    assert (momentum[:2] == 0).all() and (momentum[2:] > 0.9).all()
