@@ -33,6 +33,7 @@ FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "knn": lambda x: dp.knn(x, x, 2, exclude_self=True).squared_distance,
     "chamfer_distance": lambda x: sum(dp.chamfer_distance(x, OTHER, squared=False)),
     "earth_mover_distance": lambda x: dp.earth_mover_distance(x, OTHER).cost,
+    "earth_mover_distance, squared": lambda x: dp.earth_mover_distance(x, OTHER, squared=True).cost,
     "approxmatch": lambda x: dp.approxmatch(x, OTHER),
     "splat_depth": lambda x: dp.splat_depth(x, CAMERA).depth.clamp(max=9),
     "soft_splat": lambda x: dp.soft_splat(x, CAMERA).mask,
