@@ -1,7 +1,14 @@
 """The schedule of the auction for the earth mover's distance, which the kernels for CPU and CUDA share."""
 
 SCALING = 5.0  # factor of the bid increment (epsilon) between phases
+LEAST_SCALING = 1.5  # the least on the CPU, where a factor below the usual one gives the accuracy asked for
 COARSEST = 0.1  # first epsilon, relative to the largest cost that the extent of the pair allows
+# First epsilon on the CPU, relative to the lower bound of the mean cost that prices of 0 give.
+FIRST = 1.0
+# A first phase of more bids than this per point of the larger set has too small an epsilon, which is raised.
+LONG_PHASE = 20
+# What distances and prices are taken for, relative to the largest cost of the pair, if they are less.
+LEAST_REACH = 1e-2
 # The smallest epsilon, relative to the accepted gap: a phase leaves a mean gap of 0.4 to 0.6 epsilon.
 ENOUGH = 1.5
 # Limit on the bids of a pair, per point of its larger set; after it the remaining points are matched in order.

@@ -9,7 +9,7 @@ from torch.nn.functional import pad
 from diffpoint import _bridge, _checks
 from diffpoint.blocks import sort_into_blocks
 
-_LANES = 16  # as in kernels/sampling.py
+LANES = 16  # as in kernels/sampling.py
 _LARGE = 4096  # points from which the search with boxes is faster than updating every distance
 
 
@@ -117,7 +117,7 @@ def _farthest(
     distance = _unset_distance(points, lengths, blocks.points.shape[1])
     box_farthest = points.new_empty((batch, blocks.boxes.shape[2]))
     box_point = torch.zeros(box_farthest.shape, dtype=torch.int32)
-    scratch = distance.view(batch, -1, _LANES), distance, box_farthest, box_farthest.view(batch, -1, _LANES)
+    scratch = distance.view(batch, -1, LANES), distance, box_farthest, box_farthest.view(batch, -1, LANES)
     sorted_points = blocks.points, *lanes(blocks.points), blocks.order, blocks.box_lanes
     chosen_by = counts, starts, chosen
     _bridge.launch(
@@ -134,7 +134,7 @@ def _unset_distance(points: Tensor, lengths: Tensor, size: int) -> Tensor:
 def lanes(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """x, y and z of clouds (B, N, 3), each as (B, ceil(N / 16), 16), for kernels that load vectors of 16."""
     batch, size, _ = points.shape
-    tiles = -(-size // _LANES)
-    by_axis = pad(points.detach().movedim(-1, 0), (0, tiles * _LANES - size)).contiguous()
-    x, y, z = by_axis.view(3, batch, tiles, _LANES)
+    tiles = -(-size // LANES)
+    by_axis = pad(points.detach().movedim(-1, 0), (0, tiles * LANES - size)).contiguous()
+    x, y, z = by_axis.view(3, batch, tiles, LANES)
     return x, y, z

@@ -10,7 +10,11 @@ from torch.nn.functional import pad
 
 from diffpoint import _auction, _bridge, _checks
 from diffpoint.distances import paired_sets
-from diffpoint.sampling import lanes
+from diffpoint.sampling import LANES, lanes
+
+_ROUND = 32
+_HELPERS = 7
+_SHARED = 2**20
 
 
 class Transport(NamedTuple):
@@ -191,7 +195,10 @@ def _transport(
     # Only differences between prices matter; without this they would grow from start to start.
     prices = prices - prices.amin(1, keepdim=True)
     price_lanes = pad(prices, (0, axes[0][0].numel() - size)).view(axes[0].shape)
-    object_of, person_of, queue = (torch.full((count, size), -1, dtype=torch.int32) for _ in range(3))
+    object_of, person_of, queue, chosen = (torch.empty((count, size), dtype=torch.int32) for _ in range(4))
+    helpers = _HELPERS if count <= _HELPERS and n * m >= _SHARED else 0
+    # Of every person the objects that it may bid for next without a look at all others.
+    offers = torch.zeros((count, size, LANES), dtype=torch.int32), a.new_zeros((count, size, LANES))
     _bridge.launch(
         "transport",
         "auction_of_squares" if squared else "auction",
@@ -209,11 +216,19 @@ def _transport(
         object_of,
         person_of,
         queue,
+        chosen,
+        *offers,
+        *(x.view(count, -1) for x in offers),
+        a.new_empty((count, size)),
+        a.new_empty((count, size)),
+        torch.zeros((count, 64), dtype=torch.int32),
         bound,
         finished,
         float(tolerance),
         _auction.RESOLUTION[a.dtype.itemsize],
         _auction.BIDS_PER_PERSON,
+        _ROUND,
+        helpers,
     )
     # Indexed by the points of `a`; partners beyond the number of persons are dummy persons.
     partner = torch.where(swap[:, None], person_of, object_of)[:, :n].to(torch.int64)

@@ -117,9 +117,12 @@ OPS: dict[str, Callable[[], list[Tensor]]] = {
     ],
     "earth_mover_distance": lambda: [
         t
-        for sizes in ((1, 600, 600), (5, 300, 400))
+        for sizes in ((1, 600, 600), (5, 300, 400), (1, 1100, 1000))  # threads share the last pair
         for t in both(lambda a, b: (dp.earth_mover_distance(a, b).cost,), *sizes)
     ],
+    "earth_mover_distance, squared": lambda: both(
+        lambda a, b: (dp.earth_mover_distance(a, b, squared=True).cost,), 2, 1100, 1000
+    ),
     "approxmatch": lambda: both(lambda a, b: (dp.approxmatch(a, b),), 5, 300, 400),
     "farthest_point_sample": lambda: [
         dp.farthest_point_sample(clouds(*size, 6), 60) for size in ((5, 300), (1, 3000), (2, 9000))

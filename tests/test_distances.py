@@ -7,7 +7,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import directed_hausdorff
 
 import diffpoint as dp
-from diffpoint import distances, neighbours, reference, sampling
+from diffpoint import _auction, distances, neighbours, reference, sampling, transport
 from diffpoint._auction import RESOLUTION
 from diffpoint.testing import assert_close
 
@@ -337,6 +337,41 @@ def test_a_start_and_enough_serve_squared_costs():
     assert early.converged.all()
     assert (early.cost >= torch.minimum(enough, exact) - 1e-12).all()
     assert (early.cost <= exact + early.bound + 1e-12).all()
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_near_matches_take_about_one_bid_a_point(monkeypatch, squared):
+    a = random(2, 500, 3, seed=1, dtype=torch.float32)
+    order = torch.randperm(500, generator=torch.Generator().manual_seed(0))
+    b = a[:, order] + 0.003 * random(2, 500, 3, seed=2, dtype=torch.float32)
+    monkeypatch.setattr(_auction, "BIDS_PER_PERSON", 2)
+    result = dp.earth_mover_distance(a, b, squared=squared)
+    assert result.converged.all()
+    for x, y, cost in zip(a, b, result.cost.tolist(), strict=True):
+        assert cost <= 1.02 * scipy_cost(x, y, squared=squared)
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_points_that_crowd_where_there_is_room_for_half_of_them_are_settled_soon(monkeypatch, squared):
+    """Nearest neighbours suggest a cost of 0: the bid increment that this gives has to be raised."""
+    a = torch.zeros(1, 64, 3)
+    b = torch.zeros(1, 64, 3)
+    b[:, ::2] = torch.tensor([1.0, 0, 0])
+    monkeypatch.setattr(_auction, "BIDS_PER_PERSON", 400)
+    result = dp.earth_mover_distance(a, b, squared=squared)
+    assert result.converged.all()
+    assert result.cost.item() == pytest.approx(0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (60, 60), (90, 70)])
+def test_threads_that_help_a_pair_change_no_bit(monkeypatch, count, n, m):
+    a, b = random(count, n, 3, seed=1, dtype=torch.float32), random(count, m, 3, seed=2, dtype=torch.float32)
+    alone = dp.earth_mover_distance(a, b)
+    monkeypatch.setattr(transport, "_SHARED", 0)
+    for _ in range(5):
+        together = dp.earth_mover_distance(a, b)
+        assert all(torch.equal(x, y) for x, y in zip(alone, together, strict=True))
 
 
 @pytest.mark.parametrize("size", [0, 4])
