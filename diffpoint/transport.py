@@ -12,8 +12,10 @@ from diffpoint import _auction, _bridge, _checks
 from diffpoint.distances import paired_sets
 from diffpoint.sampling import LANES, lanes
 
-_ROUND = 32
-_HELPERS = 7
+_ROUND = 32  # persons for whom all objects are scanned at the same prices; at most 64
+# Up to so many pairs of at least so many products of sizes are each shared out among so many more threads. Which there
+# are changes only the time.
+_HELPERS = 7  # as in kernels/transport.py
 _SHARED = 2**20
 
 
@@ -195,10 +197,11 @@ def _transport(
     # Only differences between prices matter; without this they would grow from start to start.
     prices = prices - prices.amin(1, keepdim=True)
     price_lanes = pad(prices, (0, axes[0][0].numel() - size)).view(axes[0].shape)
-    object_of, person_of, queue, chosen = (torch.empty((count, size), dtype=torch.int32) for _ in range(4))
+    object_of, person_of, queue = (torch.empty((count, size), dtype=torch.int32) for _ in range(3))
     helpers = _HELPERS if count <= _HELPERS and n * m >= _SHARED else 0
+    lists = size + helpers * _ROUND
     # Of every person the objects that it may bid for next without a look at all others.
-    offers = torch.zeros((count, size, LANES), dtype=torch.int32), a.new_zeros((count, size, LANES))
+    offers = torch.zeros((count, lists, LANES), dtype=torch.int32), a.new_zeros((count, lists, LANES))
     _bridge.launch(
         "transport",
         "auction_of_squares" if squared else "auction",
@@ -216,12 +219,13 @@ def _transport(
         object_of,
         person_of,
         queue,
-        chosen,
+        torch.zeros((count, _ROUND), dtype=torch.int32),
         *offers,
         *(x.view(count, -1) for x in offers),
-        a.new_empty((count, size)),
+        a.new_empty((count, lists)),
         a.new_empty((count, size)),
         torch.zeros((count, 64), dtype=torch.int32),
+        torch.zeros((count, _ROUND), dtype=torch.int32),
         bound,
         finished,
         float(tolerance),

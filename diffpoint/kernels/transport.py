@@ -1,8 +1,12 @@
 """Assignment by auction: persons bid for objects at rising prices, with a decreasing bid increment (epsilon).
 
-Bertsekas' Gauss-Seidel auction with epsilon scaling, one pair of clouds per thread. Where there are fewer persons
-than objects, dummy persons with distance 0 to every object are added: the problem becomes symmetric, and the bound
-below holds.
+Bertsekas' auction with epsilon scaling, one pair of clouds per thread. Where there are fewer persons than objects,
+dummy persons with cost 0 for every object are added: the problem becomes symmetric, and the bound below holds.
+
+A scan of all objects for a person leaves a list of 16 offers, and a lower bound on the totals (cost plus price) of all
+other objects. As prices only rise, the list is good until its best offer exceeds that bound: most bids need no scan.
+The scans that are needed are made in rounds of a fixed number of persons, all at the same prices. Other threads can
+help with a round, and a list is the same whoever makes it, so that the result does not depend on them.
 
 After each phase the duality gap is measured. For any prices p,
     sum_i min_j (c_ij + p_j) - sum_j p_j  <=  cost of the optimal assignment,
@@ -27,7 +31,11 @@ from diffpoint.kernels._backend import ti
 LANES = 16
 STOP, BID, MEASURE, MEASURE_START = 0, 1, 2, 3  # what the auction of a pair does next
 # Columns of `shared`, each on a line of the cache of its own.
-LEFT, DONE, OVER = 0, 16, 32
+LEFT, ROUND, OVER = 0, 16, 32
+HELPERS = 7  # threads that help at most
+# How often the thread of a pair looks for the scan of a helper before it scans itself, for every 16 objects.
+PATIENCE = 8
+MOST_IDLE = 200_000  # how often a helper looks for work in vain
 
 
 def build(real):
@@ -71,9 +79,10 @@ def build(real):
             pair: ti.i32,
             person: ti.i32,
             n: ti.i32,
+            target: ti.i32,
         ):
             """Scans all objects for one person: the cheapest object of each lane at cost plus price, and its cost
-            without price, become the person's list; none of the other objects is cheaper than `rest`."""
+            without price, become the list `target`; none of the other objects is cheaper than `rest`."""
             row = ti.min(person, n - 1)
             weight = ti.select(person < n, real(1.0), real(0.0))
             x = persons[pair, row, 0]
@@ -94,21 +103,21 @@ def build(real):
                     second[s] = ti.select(loser < second[s], loser, second[s])
                     tile[s] = ti.select(cheaper, t, tile[s])
                     first[s] = ti.select(cheaper, total[s], first[s])
-            offer_tiles[pair, person] = tile
-            offer_lanes[pair, person] = first
+            offer_tiles[pair, target] = tile
+            offer_lanes[pair, target] = first
             least = second[0]
             for s in ti.static(range(1, LANES)):
                 least = ti.select(second[s] < least, second[s], least)
             # A loop, not unrolled: it costs little time, and unrolled it would take seconds to compile.
             best = real(FAR)
             for s in range(LANES):
-                entry = person * LANES + s
+                entry = target * LANES + s
                 object_of_offer[pair, entry] = object_of_offer[pair, entry] * LANES + s
                 now = price[pair, object_of_offer[pair, entry]]
                 cost = offer_cost[pair, entry] - now
                 offer_cost[pair, entry] = cost
                 best = ti.min(best, cost + now)
-            rest[pair, person] = ti.max(least, best)  # `best` is rounded: a new list must be up to date
+            rest[pair, target] = ti.max(least, best)  # `best` is rounded: a new list must be up to date
 
         @ti.func
         def best_of_list(
@@ -161,6 +170,7 @@ def build(real):
             rest: scalars2,
             total_paid: scalars2,
             shared: integers2,
+            scanned: integers2,
             bound: doubles1,
             finished: flags1,
             tolerance: ti.f64,
@@ -176,21 +186,29 @@ def build(real):
             start_cost: the mean cost of the pair that the prices to start from belong to; negative if all prices are 0.
             enough: the auction stops once the lower bound of the optimal mean cost reaches this.
             bound: upper bound of the mean cost minus the optimum.
-            shared: zeros; by it the thread of a pair and the helpers share out the scans of a round.
+            shared, scanned: zeros; by these the thread of a pair and up to HELPERS helpers share out the scans of a
+            round. The lists have `round_size` more entries for each helper, which leaves there what it finds.
             """
             for step in range((persons.shape[0] + helpers) * spread):
                 if step % spread == 0 and step // spread >= persons.shape[0]:
                     # A helper scans for persons that the threads of the pairs have chosen, until these are done. All
                     # pairs are under way: iterations start in order.
+                    helper = step // spread - persons.shape[0]
                     for pair in range(persons.shape[0]):
                         n = ti.cast(person_counts[pair], ti.i32)
                         over = 0
-                        while over == 0:
-                            # The atomic access is also a barrier: the compiler reads `LEFT` anew each time.
+                        idle = 0
+                        # It gives up where there is nothing to do for milliseconds: the thread of the pair has lost its
+                        # core, which this one must not keep busy.
+                        while over == 0 and idle < MOST_IDLE:
+                            idle += 1
+                            # Atomic accesses are also barriers: the compiler reads memory anew after them.
                             over = ti.atomic_max(shared[pair, OVER], 0)
                             if shared[pair, LEFT] > 0:
-                                k = ti.atomic_sub(shared[pair, LEFT], 1)
-                                if k > 0:
+                                now = ti.atomic_max(shared[pair, ROUND], 0)
+                                k = ti.atomic_sub(shared[pair, LEFT], 1) - 1
+                                if k >= 0:
+                                    idle = 0
                                     list_offers(
                                         persons,
                                         x_lanes,
@@ -204,10 +222,13 @@ def build(real):
                                         offer_cost,
                                         rest,
                                         pair,
-                                        ti.min(chosen[pair, k - 1], n),
+                                        ti.min(chosen[pair, k], n),
                                         n,
+                                        persons.shape[1] + helper * round_size + k,
                                     )
-                                    ti.atomic_add(shared[pair, DONE], 1)
+                                    # Of a round that has ended meanwhile nothing is used: prices may have changed.
+                                    if ti.atomic_max(shared[pair, ROUND], 0) == now:
+                                        ti.atomic_max(scanned[pair, k], now * HELPERS + helper)
                 elif step % spread == 0:
                     pair = step // spread
                     n = ti.cast(person_counts[pair], ti.i32)
@@ -234,7 +255,8 @@ def build(real):
                     bound[pair] = 0.0
                     finished[pair] = ti.u8(1)
                     started = start_cost[pair] >= 0
-                    by_others = 0
+                    now_open = 0  # the number of the round; that plus 1 while none is open
+                    looked_at = 0
                     head = 0
                     waiting = m
                     stage = MEASURE_START
@@ -282,21 +304,56 @@ def build(real):
                             head = ti.select(head < count, head - count + m, head - count)
                             waiting += count
                         else:
-                            for i in range(n):
-                                _, best, _ = best_of_list(price, object_of_offer, offer_cost, rest, pair, i)
-                                if best > rest[pair, i]:
-                                    chosen[pair, count] = i
+                            while looked_at < n and count < round_size:
+                                _, best, _ = best_of_list(
+                                    price, object_of_offer, offer_cost, rest, pair, looked_at
+                                )
+                                if best > rest[pair, looked_at]:
+                                    chosen[pair, count] = looked_at
                                     count += 1
+                                looked_at += 1
 
-                        # Scan for them.
-                        own = 0
-                        left = count
-                        if helpers > 0 and count > 0:
+                        # Scan for them; first for those that no helper has claimed, then for those whose helper is
+                        # late: it may have lost its core.
+                        claiming = helpers > 0 and count > 0
+                        own = ti.cast(0, ti.i64)
+                        if claiming:
+                            now_open += 2
+                            ti.atomic_max(shared[pair, ROUND], now_open)
                             ti.atomic_max(shared[pair, LEFT], count)  # 0 or less before
+                        left = count
                         while left > 0:
-                            if helpers > 0:
-                                left = ti.atomic_sub(shared[pair, LEFT], 1)
-                            if left > 0:
+                            k = left - 1
+                            needed_here = True
+                            if claiming:
+                                k = ti.atomic_sub(shared[pair, LEFT], 1) - 1
+                                if k < 0:
+                                    claiming = False
+                                    needed_here = False
+                                else:
+                                    own |= ti.cast(1, ti.i64) << k
+                            else:
+                                left -= 1
+                                if helpers > 0:
+                                    needed_here = (own >> k) & 1 == 0
+                                    patience = ti.select(needed_here, x_lanes.shape[1] * PATIENCE, 0)
+                                    while patience > 0:
+                                        patience -= 1
+                                        by = ti.atomic_max(scanned[pair, k], 0)
+                                        if by // HELPERS == now_open:
+                                            source = persons.shape[1] + by % HELPERS * round_size + k
+                                            target = ti.min(chosen[pair, k], n)
+                                            for s in range(LANES):
+                                                object_of_offer[pair, target * LANES + s] = object_of_offer[
+                                                    pair, source * LANES + s
+                                                ]
+                                                offer_cost[pair, target * LANES + s] = offer_cost[
+                                                    pair, source * LANES + s
+                                                ]
+                                            rest[pair, target] = rest[pair, source]
+                                            patience = 0
+                                            needed_here = False
+                            if needed_here:
                                 list_offers(
                                     persons,
                                     x_lanes,
@@ -310,17 +367,12 @@ def build(real):
                                     offer_cost,
                                     rest,
                                     pair,
-                                    ti.min(chosen[pair, left - 1], n),
+                                    ti.min(chosen[pair, k], n),
                                     n,
+                                    ti.min(chosen[pair, k], n),
                                 )
-                                own += 1
-                                left -= 1
-                                if helpers > 0:
-                                    left = 1
-                        by_others += count - own
-                        if by_others > 0:
-                            while ti.atomic_max(shared[pair, DONE], 0) < by_others:
-                                pass
+                        if helpers > 0 and count > 0:
+                            ti.atomic_max(shared[pair, ROUND], now_open + 1)
 
                         if stage == BID:
                             if waiting == 0 or bids >= bid_limit:
@@ -335,8 +387,9 @@ def build(real):
                                             object_of[pair, i] = free
                                             person_of[pair, free] = i
                                     finished[pair] = ti.u8(0)
-                        else:
+                        elif looked_at == n:
                             # All lists are up to date: measure.
+                            looked_at = 0
                             lowest_price = real(FAR)
                             highest_price = real(0.0)
                             lower_bound = ti.cast(0.0, ti.f64)
