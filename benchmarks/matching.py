@@ -20,6 +20,7 @@ def races() -> Iterator[Race]:
     yield from _transport(8, 512, directions=("forward",))
     yield from _transport(8, 2048)
     yield from _transport(160, 2048, directions=("forward",), alone=True)
+    yield from _transport(1, 8192, directions=("forward",), alone=True)  # threads share out the pair
     yield from _soft(8, 2048)
     yield from _diversity(5, 4, 2048)
     yield _farthest(2, 16384, 2048)

@@ -186,9 +186,19 @@ def check_sets(
 
 
 def check_transport(
-    a: Tensor, b: Tensor, a_lengths: Tensor, b_lengths: Tensor, prices: Tensor, known_cost: Tensor
+    a: Tensor,
+    b: Tensor,
+    a_lengths: Tensor,
+    b_lengths: Tensor,
+    prices: Tensor,
+    known_cost: Tensor,
+    squared: bool,
 ) -> Tensor:
-    """The values of the arguments of `earth_mover_distance`. Returns the extent (B,) of each pair."""
+    """The values of the arguments of `earth_mover_distance`.
+
+    Returns the largest cost (B,) that two points of a pair can have by their bounding box, above 0 because bid
+    increments are relative to it.
+    """
     name = "earth_mover_distance"
     check_sets(name, a, b, a_lengths, b_lengths, smallest=1)
     for argument, values in (("start.prices", prices), ("start.cost", known_cost)):
@@ -196,22 +206,27 @@ def check_transport(
     if not len(a):
         return a.new_empty(0)
     extent = _extent(a.detach(), a_lengths, b.detach(), b_lengths)
-    if not bool((extent < _auction.LARGEST_EXTENT).all()):
-        raise fail(
-            name, "a", "span less than 1e18 together with 'b'", f"{extent.max():.3g}", "Scale both down."
-        )
-    return extent
+    largest = extent.square() if squared else extent
+    if not bool((largest < _auction.LARGEST_COST).all()):
+        raise fail(name, "a", expected_extent(squared), f"{extent.max():.3g}", "Scale both down.")
+    return largest.clamp(min=_auction.SMALLEST_COST).to(a.dtype)
+
+
+def expected_extent(squared: bool) -> str:
+    """What `earth_mover_distance` expects of the extent of its first argument."""
+    if squared:
+        return "span less than 1e9 together with 'b' for squared distances"
+    return "span less than 1e18 together with 'b'"
 
 
 def _extent(a: Tensor, a_lengths: Tensor, b: Tensor, b_lengths: Tensor) -> Tensor:
-    """Diagonal of the bounding box of each pair; at least 1e-20, because bid increments are relative to it."""
+    """Diagonal of the bounding box of each pair, in float64."""
     low, high = [], []
     for cloud, counts in ((a, a_lengths), (b, b_lengths)):
         padding = (torch.arange(cloud.shape[1], device=cloud.device) >= counts[:, None])[..., None]
         low.append(cloud.masked_fill(padding, torch.inf).amin(1))
         high.append(cloud.masked_fill(padding, -torch.inf).amax(1))
-    diagonal = (torch.maximum(*high) - torch.minimum(*low)).norm(dim=-1, dtype=torch.float64).to(a.dtype)
-    return diagonal.clamp(min=1e-20)
+    return (torch.maximum(*high) - torch.minimum(*low)).norm(dim=-1, dtype=torch.float64)
 
 
 def check_depth(function: str, name: str, depth: Tensor) -> None:

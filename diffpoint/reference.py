@@ -338,7 +338,12 @@ def f_score(
 
 
 def earth_mover_distance(
-    a: Tensor, b: Tensor, *, a_lengths: Tensor | None = None, b_lengths: Tensor | None = None
+    a: Tensor,
+    b: Tensor,
+    *,
+    squared: bool = False,
+    a_lengths: Tensor | None = None,
+    b_lengths: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Exact cost (*B) and assignment (*B, N), by shortest augmenting paths."""
     batch = a.shape[:-2]
@@ -347,7 +352,8 @@ def earth_mover_distance(
     lb = torch.full((len(b3),), b.shape[-2]) if b_lengths is None else b_lengths.reshape(-1)
     costs, assignments = [], []
     for x, y, n, m in zip(a3, b3, la.tolist(), lb.tolist(), strict=True):
-        matrix = _sqrt(pairwise_squared_distance(x[:n], y[:m]))
+        squares = pairwise_squared_distance(x[:n], y[:m])
+        matrix = squares if squared else _sqrt(squares)
         columns = torch.full((len(x),), -1)
         if n <= m:
             columns[:n] = assign(matrix.detach())

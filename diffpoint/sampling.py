@@ -7,9 +7,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from diffpoint import _bridge, _checks
-from diffpoint.blocks import sort_into_blocks
+from diffpoint.blocks import LANES, sort_into_blocks
 
-_LANES = 16  # as in kernels/sampling.py
 _LARGE = 4096  # points from which the search with boxes is faster than updating every distance
 
 
@@ -115,7 +114,7 @@ def _farthest(
         return chosen
     blocks = sort_into_blocks(points, lengths)
     sets = blocks.points, *lanes(blocks.points), blocks.order, blocks.box_lanes, blocks.group_lanes
-    distance = _unset_distance(points, lengths, blocks.points.shape[1]).view(batch, -1, _LANES)
+    distance = _unset_distance(points, lengths, blocks.points.shape[1]).view(batch, -1, LANES)
     largest = (points.new_empty((batch, *x.shape[2:])) for x in (blocks.box_lanes, blocks.group_lanes))
     chosen_by = counts, starts, chosen
     _bridge.launch("sampling", "farthest_blocks", points.dtype, *sets, distance, *largest, *chosen_by)
@@ -130,7 +129,7 @@ def _unset_distance(points: Tensor, lengths: Tensor, size: int) -> Tensor:
 def lanes(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """x, y and z of clouds (B, N, 3), each as (B, ceil(N / 16), 16), for kernels that load vectors of 16."""
     batch, size, _ = points.shape
-    tiles = -(-size // _LANES)
-    by_axis = pad(points.detach().movedim(-1, 0), (0, tiles * _LANES - size)).contiguous()
-    x, y, z = by_axis.view(3, batch, tiles, _LANES)
+    tiles = -(-size // LANES)
+    by_axis = pad(points.detach().movedim(-1, 0), (0, tiles * LANES - size)).contiguous()
+    x, y, z = by_axis.view(3, batch, tiles, LANES)
     return x, y, z

@@ -129,10 +129,11 @@ OPS: dict[str, Callable[[], list[Tensor]]] = {
     "unidirectional_hausdorff_distance": lambda: alone(
         lambda x: (dp.unidirectional_hausdorff_distance(x[0], x[1:]),), 5, 300
     ),
+    # The threads share out the last pair.
     "earth_mover_distance": lambda: [
         t
-        for sizes in ((1, 600, 600), (5, 300, 400))
-        for t in both(lambda a, b: (dp.earth_mover_distance(a, b).cost,), *sizes)
+        for squared, sizes in ((False, (1, 600, 600)), (True, (5, 300, 400)), (False, (1, 1100, 1000)))
+        for t in both(lambda a, b, s=squared: (dp.earth_mover_distance(a, b, squared=s).cost,), *sizes)
     ],
     "approxmatch": lambda: both(lambda a, b: (dp.approxmatch(a, b),), 5, 300, 400),
     "farthest_point_sample": lambda: [

@@ -49,9 +49,10 @@ def random(*shape: int, seed: int, dtype: torch.dtype = torch.float32) -> torch.
     return points.to(DEVICE, dtype)
 
 
-def optimum(a: torch.Tensor, b: torch.Tensor) -> float:
+def optimum(a: torch.Tensor, b: torch.Tensor, *, squared: bool = False) -> float:
     a, b = a.double().cpu(), b.double().cpu()
     matrix = np.linalg.norm(a.numpy()[:, None] - b.numpy()[None], axis=-1)
+    matrix = matrix**2 if squared else matrix
     rows, columns = linear_sum_assignment(matrix)
     return float(matrix[rows, columns].mean())
 
@@ -64,6 +65,7 @@ def assert_near_optimum(
     *,
     tolerance: float = 0.02,
     converged: bool = True,
+    squared: bool = False,
 ) -> None:
     """One-to-one assignments whose cost and bound are right; within the tolerance if they should be."""
     rounding = ROUNDING[a.dtype]
@@ -75,8 +77,9 @@ def assert_near_optimum(
         assert len(partners) == min(n, m) == len(partners.unique())
         assert (matched < n).all()
         assert (partners < m).all()
-        assert cost == pytest.approx(float((x[matched] - y[partners]).norm(dim=-1).mean()), abs=rounding)
-        assert -rounding <= cost - optimum(x, y) <= bound + rounding
+        apart = (x[matched] - y[partners]).norm(dim=-1)
+        assert cost == pytest.approx(float((apart**2 if squared else apart).mean()), abs=rounding)
+        assert -rounding <= cost - optimum(x, y, squared=squared) <= bound + rounding
         assert bool(result.converged[pair]) == converged
         if converged:
             assert bound <= tolerance * cost + rounding
@@ -86,9 +89,15 @@ def assert_near_optimum(
 
 
 @pytest.mark.parametrize(
-    ("dtype", "tolerance", "tiles"), [(torch.float32, 0.02, "small_tiles"), (torch.float64, 1e-3, None)]
+    ("dtype", "tolerance", "tiles", "squared"),
+    [
+        (torch.float32, 0.02, "small_tiles", False),
+        (torch.float64, 1e-3, None, False),
+        (torch.float32, 0.02, None, True),
+        (torch.float64, 1e-3, "small_tiles", True),
+    ],
 )
-def test_emd_is_within_its_bound_and_tolerance(dtype, tolerance, tiles, request):
+def test_emd_is_within_its_bound_and_tolerance(dtype, tolerance, tiles, squared, request):
     if tiles:
         request.getfixturevalue(tiles)
     lengths = [(1, 6), (9, 9), (4, 10), (9, 3), (1, 1)]
@@ -96,8 +105,8 @@ def test_emd_is_within_its_bound_and_tolerance(dtype, tolerance, tiles, request)
     for pair, (n, m) in enumerate(lengths):
         a[pair, n:], b[pair, m:] = torch.nan, torch.nan  # must not be read
     la, lb = torch.tensor(lengths, device=DEVICE).T
-    result = dp.earth_mover_distance(a, b, a_lengths=la, b_lengths=lb, tolerance=tolerance)
-    assert_near_optimum(result, a, b, lengths, tolerance=tolerance)
+    result = dp.earth_mover_distance(a, b, squared=squared, a_lengths=la, b_lengths=lb, tolerance=tolerance)
+    assert_near_optimum(result, a, b, lengths, tolerance=tolerance, squared=squared)
 
 
 def test_few_points_and_many():
@@ -201,22 +210,24 @@ def test_without_bids_left_the_rest_is_matched_in_order(monkeypatch, bids):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_the_gradient_is_that_of_the_cpu_for_the_same_assignment(dtype):
+@pytest.mark.parametrize("squared", [False, True])
+def test_the_gradient_is_that_of_the_cpu_for_the_same_assignment(dtype, squared):
     lengths = torch.tensor([[9, 5], [4, 7]], device=DEVICE)
     a, b = random(2, 9, 3, seed=1, dtype=dtype), random(2, 7, 3, seed=2, dtype=dtype)
     b[0, 2] = a[0, 3]  # no direction where matched points coincide
     a.requires_grad_()
     b.requires_grad_()
-    result = dp.earth_mover_distance(a, b, a_lengths=lengths[:, 0], b_lengths=lengths[:, 1])
+    result = dp.earth_mover_distance(a, b, squared=squared, a_lengths=lengths[:, 0], b_lengths=lengths[:, 1])
     weights = torch.tensor([1.0, -3.0], dtype=dtype, device=DEVICE)
     found = torch.autograd.grad((result.cost * weights).sum(), (a, b))
     backward = torch.ops.diffpoint.earth_mover_distance_backward
     arguments = a.detach(), b.detach(), result.assignment, weights / lengths.amin(1)
-    expected = on_cpu(lambda: backward(*(x.cpu() for x in arguments)))
+    expected = on_cpu(lambda: backward(*(x.cpu() for x in arguments), squared))
     for here, there in zip(found, expected, strict=True):
         torch.testing.assert_close(here.cpu(), there, rtol=0, atol=ROUNDING[dtype])
     assert not found[1][0, 2].any()
-    assert (found[0][1, :4].norm(dim=-1) - 0.75).abs().max() < 1e-6
+    if not squared:
+        assert (found[0][1, :4].norm(dim=-1) - 0.75).abs().max() < 1e-6
     assert not found[0][1, 4:].any()
 
 
@@ -244,6 +255,10 @@ BAD_CALLS = {
     ),
     "empty": (lambda: dp.earth_mover_distance(POINTS, POINTS[:, :0]), "'b' must hold at least one point"),
     "extent": (lambda: dp.earth_mover_distance(WIDE, POINTS), "'a' must span less than 1e18 together with 'b'"),
+    "extent of squares": (
+        lambda: dp.earth_mover_distance(WIDE / 1e9, POINTS, squared=True),
+        "'a' must span less than 1e9 together with 'b' for squared distances",
+    ),
     "prices": (lambda: from_start(prices=POINTS[..., 0] / 0), "'start.prices' must be finite"),
     "cost": (lambda: from_start(cost=POINTS[:, 0, 0] / 0), "'start.cost' must be finite"),
 }  # fmt: skip
@@ -268,7 +283,9 @@ def test_the_auction_ends_with_values_that_are_not_allowed(case, monkeypatch):
 
     monkeypatch.setattr(RUNTIME, "checks", "off")
     result = BAD_CALLS[case][0]()
-    unusable = {"a": [0, 1], "b": [0, 1], "none": [0, 1], "extent": [0, 1]}.get(case, [])
+    unusable = {"a": [0, 1], "b": [0, 1], "none": [0, 1], "extent": [0, 1], "extent of squares": [0, 1]}.get(
+        case, []
+    )
     for pair in range(2):
         if pair in unusable:
             assert result.cost[pair].isnan()

@@ -7,7 +7,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import directed_hausdorff
 
 import diffpoint as dp
-from diffpoint import distances, neighbours, reference, sampling
+from diffpoint import _auction, distances, neighbours, reference, sampling, transport
 from diffpoint.testing import assert_close
 
 DTYPES = (torch.float32, torch.float64)
@@ -249,8 +249,9 @@ def test_chamfer_scales_with_the_clouds_and_ignores_order_and_motion():
     assert_close(torch.stack(dp.chamfer_distance(b, a, squared=False)), before.flip(0), scale=10)
 
 
-def scipy_cost(a: torch.Tensor, b: torch.Tensor) -> float:
+def scipy_cost(a: torch.Tensor, b: torch.Tensor, *, squared: bool = False) -> float:
     matrix = np.linalg.norm(a.double().numpy()[:, None] - b.double().numpy()[None], axis=-1)
+    matrix = matrix**2 if squared else matrix
     rows, columns = linear_sum_assignment(matrix)
     return float(matrix[rows, columns].mean())
 
@@ -258,12 +259,14 @@ def scipy_cost(a: torch.Tensor, b: torch.Tensor) -> float:
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(("n", "m"), [(2, 2), (1, 9), (100, 40), (300, 300), (257, 511)])
 @pytest.mark.parametrize("tolerance", [0.05, 1e-3])
-def test_emd_is_within_its_bound_and_tolerance(dtype, n, m, tolerance):
-    a, b = random(2, n, 3, seed=1, dtype=dtype), random(2, m, 3, seed=2, dtype=dtype)
-    result = dp.earth_mover_distance(a, b, tolerance=tolerance)
+@pytest.mark.parametrize("squared", [False, True])
+@pytest.mark.parametrize("space", [2, 3])
+def test_emd_is_within_its_bound_and_tolerance(dtype, n, m, tolerance, squared, space):
+    a, b = random(2, n, space, seed=1, dtype=dtype), random(2, m, space, seed=2, dtype=dtype)
+    result = dp.earth_mover_distance(a, b, tolerance=tolerance, squared=squared)
     assert result.converged.all()
     for pair in range(2):
-        exact = scipy_cost(a[pair], b[pair])
+        exact = scipy_cost(a[pair], b[pair], squared=squared)
         excess = result.cost[pair].item() - exact
         rounding = 1e-6 if dtype == torch.float32 else 1e-12
         assert -rounding <= excess <= result.bound[pair].item() + rounding
@@ -284,6 +287,93 @@ def test_emd_of_a_permuted_copy_is_zero_and_finds_the_permutation():
     result = dp.earth_mover_distance(a[:, order], a)
     assert result.cost.item() == 0
     assert torch.equal(result.assignment[0], order)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_squared_costs_choose_their_own_assignment(dtype):
+    """Two steps of length 1 instead of one of length 2 and one of 0: the same sum, but half the sum of squares."""
+    a = torch.tensor([[0.0, 0, 0], [1, 0, 0]], dtype=dtype, requires_grad=True)
+    b = torch.tensor([[1.0, 0, 0], [2, 0.1, 0]], dtype=dtype, requires_grad=True)
+    result = dp.earth_mover_distance(a, b, squared=True, tolerance=1e-6)
+    assert result.assignment.tolist() == [0, 1]
+    assert result.cost.item() == pytest.approx(1.005, rel=1e-6)
+    for ours, exact in zip(
+        torch.autograd.grad(result.cost, (a, b)), ((a - b).detach(), (b - a).detach()), strict=True
+    ):
+        assert_close(ours, exact)  # 2 (a - b) / 2
+
+
+def test_the_padding_counts_for_nothing_in_squared_costs():
+    lengths = {"a_lengths": torch.tensor([20, 7, 30]), "b_lengths": torch.tensor([40, 40, 11])}
+    a, b = three_pairs(30, 40)
+    for i in range(3):
+        a[i, lengths["a_lengths"][i] :] = torch.nan
+        b[i, lengths["b_lengths"][i] :] = torch.nan
+    result = dp.earth_mover_distance(a, b, squared=True, tolerance=1e-5, **lengths)  # pyright: ignore
+    exact = [
+        scipy_cost(x[:n], y[:m], squared=True)
+        for x, y, n, m in zip(a, b, *(v.tolist() for v in lengths.values()), strict=True)
+    ]
+    torch.testing.assert_close(result.cost, torch.tensor(exact, dtype=a.dtype), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_squared_costs_of_any_unit(scale):
+    a, b = random(1, 60, 3, seed=1) * scale, random(1, 70, 3, seed=2) * scale
+    result = dp.earth_mover_distance(a, b, squared=True)
+    exact = scipy_cost(a[0], b[0], squared=True)
+    assert exact * (1 - 1e-5) <= result.cost.item() <= 1.02 * exact
+    assert result.converged.all()
+
+
+def test_a_start_and_enough_serve_squared_costs():
+    a, b = three_pairs(40, 50)
+    start = dp.earth_mover_distance(a, b, squared=True)
+    moved = a + 1e-3 * torch.sin(torch.arange(40, dtype=a.dtype))[:, None]
+    exact, _ = reference.earth_mover_distance(moved, b, squared=True)
+    result = dp.earth_mover_distance(moved, b, squared=True, start=start, tolerance=1e-3)
+    assert (result.cost >= exact - 1e-12).all()
+    assert (result.cost <= exact * (1 + 1e-3)).all()
+    enough = exact * torch.tensor([0.2, 0.9, 1.1], dtype=a.dtype)
+    early = dp.earth_mover_distance(moved, b, squared=True, enough=enough)
+    assert early.converged.all()
+    assert (early.cost >= torch.minimum(enough, exact) - 1e-12).all()
+    assert (early.cost <= exact + early.bound + 1e-12).all()
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_near_matches_take_about_one_bid_a_point(monkeypatch, squared):
+    a = random(2, 500, 3, seed=1, dtype=torch.float32)
+    order = torch.randperm(500, generator=torch.Generator().manual_seed(0))
+    b = a[:, order] + 0.003 * random(2, 500, 3, seed=2, dtype=torch.float32)
+    monkeypatch.setattr(_auction, "BIDS_PER_PERSON", 2)
+    result = dp.earth_mover_distance(a, b, squared=squared)
+    assert result.converged.all()
+    for x, y, cost in zip(a, b, result.cost.tolist(), strict=True):
+        assert cost <= 1.02 * scipy_cost(x, y, squared=squared)
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_points_that_crowd_where_there_is_room_for_half_of_them_are_settled_soon(monkeypatch, squared):
+    """Nearest neighbours suggest a cost of 0: the bid increment that this gives has to be raised."""
+    a = torch.zeros(1, 64, 3)
+    b = torch.zeros(1, 64, 3)
+    b[:, ::2] = torch.tensor([1.0, 0, 0])
+    monkeypatch.setattr(_auction, "BIDS_PER_PERSON", 400)
+    result = dp.earth_mover_distance(a, b, squared=squared)
+    assert result.converged.all()
+    assert result.cost.item() == pytest.approx(0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (60, 60), (90, 70)])
+def test_threads_that_help_a_pair_change_no_bit(monkeypatch, count, n, m):
+    a, b = random(count, n, 3, seed=1, dtype=torch.float32), random(count, m, 3, seed=2, dtype=torch.float32)
+    alone = dp.earth_mover_distance(a, b)
+    monkeypatch.setattr(transport, "_SHARED", 0)
+    for _ in range(5):
+        together = dp.earth_mover_distance(a, b)
+        assert all(torch.equal(x, y) for x, y in zip(alone, together, strict=True))
 
 
 @pytest.mark.parametrize("size", [0, 4])
@@ -514,6 +604,9 @@ def test_sets_that_span_too_much_are_refused_and_the_padding_is_ignored(dtype):
         dp.earth_mover_distance(a, b)
     counted = dp.earth_mover_distance(a, b, a_lengths=torch.tensor([5, 4, 5]))
     assert counted.converged.all()
+    a[1, 4, 2] = 3e9
+    with pytest.raises(ValueError, match=r"'a' must span less than 1e9 .* squared distances; got 3e\+09"):
+        dp.earth_mover_distance(a, b, squared=True)
     a[1, 4, 2] = 1e17
     wide = dp.earth_mover_distance(a, b)
     exact, _ = reference.earth_mover_distance(a, b)

@@ -32,7 +32,16 @@ def operator_arguments() -> dict[str, tuple]:
         "project": (a, projection),
         "unproject": (depth, camera.back_projection.clone().requires_grad_()),
         "reproject": (depth, camera.back_projection.clone().requires_grad_(), projection, H, W),
-        "earth_mover_distance": (a, b, *lengths, torch.zeros(B, N), -torch.ones(B), torch.ones(B), 0.02),
+        "earth_mover_distance": (
+            a,
+            b,
+            *lengths,
+            torch.zeros(B, N),
+            -torch.ones(B),
+            torch.ones(B),
+            0.02,
+            True,
+        ),
         "approxmatch": (a, b, *lengths, True),
         "farthest_point_sample": (
             a.detach(),
@@ -65,6 +74,7 @@ def test_every_operator_is_checked():
         lambda a, b: dp.knn(a, b, 2).squared_distance.sum(),
         lambda a, b: sum(dp.chamfer_distance(a, b, squared=True)).sum(),
         lambda a, b: dp.earth_mover_distance(a, b).cost.sum(),
+        lambda a, b: dp.earth_mover_distance(a, b, squared=True).cost.sum(),
     ],
 )
 def test_a_second_derivative_is_refused(function):

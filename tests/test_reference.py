@@ -209,6 +209,11 @@ CASES = {
         lambda a, b: dp.earth_mover_distance(a, b, a_lengths=LENGTHS, tolerance=1e-7)[:2],
         lambda a, b: reference.earth_mover_distance(a, b, a_lengths=LENGTHS),
     ),
+    "earth_mover_distance, squared": Case(
+        sets,
+        lambda a, b: dp.earth_mover_distance(a, b, squared=True, a_lengths=LENGTHS, tolerance=1e-7)[:2],
+        lambda a, b: reference.earth_mover_distance(a, b, squared=True, a_lengths=LENGTHS),
+    ),
     "approxmatch": two_sets("approxmatch"),
     "splat_depth": splat(0.0),
     "splat_depth, radius 0.8": splat(0.8),

@@ -37,6 +37,7 @@ FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "total_mutual_difference": lambda x: dp.total_mutual_difference(x, squared=True),
     "unidirectional_hausdorff_distance": lambda x: dp.unidirectional_hausdorff_distance(x[0], OTHER),
     "earth_mover_distance": lambda x: dp.earth_mover_distance(x, OTHER).cost,
+    "earth_mover_distance, squared": lambda x: dp.earth_mover_distance(x, OTHER, squared=True).cost,
     "approxmatch": lambda x: dp.approxmatch(x, OTHER),
     "splat_depth": lambda x: dp.splat_depth(x, CAMERA).depth.clamp(max=9),
     "soft_splat": lambda x: dp.soft_splat(x, CAMERA).mask,

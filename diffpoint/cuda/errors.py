@@ -30,7 +30,8 @@ _KINDS = {
     ),
     "last row": ("end in the row [0, ..., 0, 1]", "Divide the matrix by its last entry, or transpose it."),
     "invertible": ("be invertible", "Is a focal length 0?"),
-    "extent": ("span less than 1e18 together with 'b'", "Scale both down."),
+    "extent": (_checks.expected_extent(squared=False), "Scale both down."),
+    "extent of squares": (_checks.expected_extent(squared=True), "Scale both down."),
 }
 
 

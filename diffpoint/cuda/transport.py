@@ -35,7 +35,7 @@ _LINE = tl.constexpr(1024)  # objects or persons at once elsewhere
 _MEASURED = tl.constexpr(16)  # persons at once when the gap is measured
 _FREE, _DUMMY = tl.constexpr(-1), tl.constexpr(-2)  # owners
 _FAR = tl.constexpr(_auction.FAR)  # no price exceeds it
-_LARGEST = tl.constexpr(_auction.LARGEST_EXTENT)
+_LARGEST, _SMALLEST = tl.constexpr(_auction.LARGEST_COST), tl.constexpr(_auction.SMALLEST_COST)
 _SCALING = tl.constexpr(_auction.SCALING)
 _COARSEST = tl.constexpr(_auction.COARSEST)
 _ENOUGH = tl.constexpr(_auction.ENOUGH)
@@ -66,16 +66,27 @@ def _sum_of_squares(x, y, z):
 
 
 @triton.jit
-def _totals(x, y, z, objects, price, j, width):
-    """Distance plus price of a tile of objects, for persons at (P, 1) coordinates."""
-    dx = tl.load(objects + j)[None, :] - x
-    dy = tl.load(objects + width + j)[None, :] - y
-    dz = tl.load(objects + 2 * width + j)[None, :] - z
-    return tl.sqrt(_sum_of_squares(dx, dy, dz)) + tl.load(price + j)[None, :]
+def _cost(dx, dy, dz, SQUARED: tl.constexpr):
+    """Of matching two points with this difference, rounded as on the CPU."""
+    squares = _sum_of_squares(dx, dy, dz)
+    return squares if SQUARED else _root(squares)
 
 
 @triton.jit
-def _two_cheapest(persons, i, objects, price, m, width, PERSONS: tl.constexpr, OBJECTS: tl.constexpr):
+def _totals(x, y, z, objects, price, j, width, SQUARED: tl.constexpr):
+    """Cost plus price of a tile of objects, for persons at (P, 1) coordinates."""
+    dx = tl.load(objects + j)[None, :] - x
+    dy = tl.load(objects + width + j)[None, :] - y
+    dz = tl.load(objects + 2 * width + j)[None, :] - z
+    squares = _sum_of_squares(dx, dy, dz)
+    return (squares if SQUARED else tl.sqrt(squares)) + tl.load(price + j)[None, :]
+
+
+@triton.jit
+def _two_cheapest(
+    persons, i, objects, price, m, width,
+    SQUARED: tl.constexpr, PERSONS: tl.constexpr, OBJECTS: tl.constexpr,
+):  # fmt: skip
     """For each person the lowest total, the second lowest, and the object of the lowest. Each lane keeps the two
     cheapest of its own objects, so that the loop has no reduction; the lanes are compared at the end."""
     x = tl.load(persons + i * 3)[:, None]
@@ -86,7 +97,7 @@ def _two_cheapest(persons, i, objects, price, m, width, PERSONS: tl.constexpr, O
     second = tl.full((PERSONS, OBJECTS), float("inf"), price.dtype.element_ty)
     tile = tl.zeros((PERSONS, OBJECTS), tl.int32)
     for start in range(0, m, OBJECTS):
-        total = _totals(x, y, z, objects, price, start + lane, width)
+        total = _totals(x, y, z, objects, price, start + lane, width, SQUARED)
         second = tl.minimum(second, tl.maximum(first, total))
         tile = tl.where(total < first, start, tile)
         first = tl.minimum(first, total)
@@ -99,9 +110,12 @@ def _two_cheapest(persons, i, objects, price, m, width, PERSONS: tl.constexpr, O
 
 
 @triton.jit
-def _offers(persons, i, objects, price, m, width, epsilon, PERSONS: tl.constexpr, OBJECTS: tl.constexpr):
+def _offers(
+    persons, i, objects, price, m, width, epsilon,
+    SQUARED: tl.constexpr, PERSONS: tl.constexpr, OBJECTS: tl.constexpr,
+):  # fmt: skip
     """For each person the object that is best for it, and the price that it bids."""
-    best, next_best, j = _two_cheapest(persons, i, objects, price, m, width, PERSONS, OBJECTS)
+    best, next_best, j = _two_cheapest(persons, i, objects, price, m, width, SQUARED, PERSONS, OBJECTS)
     # A single object has no second best offer, so its price rises by epsilon only.
     return j, tl.load(price + j) + (tl.where(m > 1, next_best - best, 0.0) + epsilon)
 
@@ -109,14 +123,14 @@ def _offers(persons, i, objects, price, m, width, epsilon, PERSONS: tl.constexpr
 @triton.jit
 def _bid_at_once(
     persons, objects, price, owner, partner, queue, head, waiting, dummies, m, width, epsilon,
-    PERSONS: tl.constexpr, OBJECTS: tl.constexpr,
+    SQUARED: tl.constexpr, PERSONS: tl.constexpr, OBJECTS: tl.constexpr,
 ):  # fmt: skip
     """The first persons of the queue bid. Returns its new head and length, and the number of waiting dummies."""
     rank = tl.arange(0, PERSONS)
     count = tl.minimum(waiting, PERSONS)
     live = rank < count
     i = tl.load(queue + ((head + rank) & (width - 1)), mask=live, other=0)
-    j, offer = _offers(persons, i, objects, price, m, width, epsilon, PERSONS, OBJECTS)
+    j, offer = _offers(persons, i, objects, price, m, width, epsilon, SQUARED, PERSONS, OBJECTS)
     previous = tl.load(owner + j)
     # The highest of the offers for an object wins, the earliest of equal ones.
     higher = (offer[None, :] > offer[:, None]) | (
@@ -143,7 +157,7 @@ def _bid_at_once(
 @triton.jit
 def _bid_in_a_chain(
     persons, objects, price, owner, partner, queue, head, waiting, dummies, bids, limit, m, width, epsilon,
-    OBJECTS: tl.constexpr,
+    SQUARED: tl.constexpr, OBJECTS: tl.constexpr,
 ):  # fmt: skip
     """The first person of the queue bids, then who loses the object to it, and so on up to an object that no person
     has. Returns what `_bid_at_once` does, and the number of bids."""
@@ -152,7 +166,7 @@ def _bid_in_a_chain(
     waiting -= 1
     while (i >= 0) & (bids < limit):
         objects_of, offers = _offers(
-            persons, tl.full((1,), 0, tl.int32) + i, objects, price, m, width, epsilon, 1, OBJECTS
+            persons, tl.full((1,), 0, tl.int32) + i, objects, price, m, width, epsilon, SQUARED, 1, OBJECTS
         )
         j = tl.sum(objects_of, axis=0)
         offer = tl.sum(offers, axis=0)
@@ -229,7 +243,7 @@ def _place_dummies(price, owner, partner, queue, dummies, m, epsilon, LINE: tl.c
 @triton.jit
 def _measure(
     persons, objects, price, partner, queue, n, m, width, finer,
-    PERSONS: tl.constexpr, OBJECTS: tl.constexpr, LINE: tl.constexpr,
+    SQUARED: tl.constexpr, PERSONS: tl.constexpr, OBJECTS: tl.constexpr, LINE: tl.constexpr,
 ):  # fmt: skip
     """The lower bound of the cost that the prices give, the lowest price, the cost, and the length of the queue: of the
     persons with an offer better than what they have by more than `finer`."""
@@ -253,7 +267,7 @@ def _measure(
         first = tl.full((PERSONS, OBJECTS), float("inf"), price.dtype.element_ty)
         for begin in range(0, m, OBJECTS):
             tile = begin + tl.arange(0, OBJECTS)
-            total = _totals(x[:, None], y[:, None], z[:, None], objects, price, tile, width)
+            total = _totals(x[:, None], y[:, None], z[:, None], objects, price, tile, width, SQUARED)
             first = tl.minimum(first, total)
         cheapest = _number(tl.min(_order(first), axis=1), first.dtype)
         bounds += tl.where(inside, cheapest, 0.0).to(tl.float64)
@@ -262,9 +276,9 @@ def _measure(
         dx = tl.load(objects + j, mask=placed, other=0.0) - x
         dy = tl.load(objects + width + j, mask=placed, other=0.0) - y
         dz = tl.load(objects + 2 * width + j, mask=placed, other=0.0) - z
-        distance = _root(_sum_of_squares(dx, dy, dz))
-        costs += tl.where(placed, distance, 0.0).to(tl.float64)
-        paid = distance + tl.load(price + j, mask=placed, other=0.0)
+        paid = _cost(dx, dy, dz, SQUARED)
+        costs += tl.where(placed, paid, 0.0).to(tl.float64)
+        paid += tl.load(price + j, mask=placed, other=0.0)
         unhappy = placed & (paid > cheapest + finer)
         slot = waiting + tl.cumsum(unhappy.to(tl.int32), axis=0) - 1
         tl.store(queue + slot, i, mask=unhappy)
@@ -369,6 +383,7 @@ def _match(
     a, b, a_lengths, b_lengths, start_prices, start_costs, enoughs,
     costs, assignments, bounds, finished_flags, prices, reals, integers, bad_price, bad_cost, too_wide,
     size_a, size_b, width, tolerance_bits, resolution_bits, bids_per_person,
+    SQUARED: tl.constexpr,
 ):  # fmt: skip
     """One pair. `reals` and `integers` hold 4 x `width` numbers for each, `width` a power of two."""
     row = tl.program_id(0).to(tl.int64)
@@ -394,13 +409,14 @@ def _match(
     tolerance = real(tolerance_bits, tl.float64)
 
     diagonal, bad = _box(persons, others, n, m, _LINE)
+    largest = diagonal * diagonal if SQUARED else diagonal
     usable = (n > 0) & (bad == 0)
-    if usable & (diagonal >= _LARGEST):
+    if usable & (largest >= _LARGEST):
         tl.atomic_add(too_wide, 1)
-    usable = usable & (diagonal < _LARGEST)
-    extent = tl.minimum(tl.maximum(diagonal, 1e-20), _LARGEST).to(dtype)
-    smallest_epsilon = (extent.to(tl.float64) * real(resolution_bits, tl.float64)).to(dtype)
-    coarsest = tl.maximum(extent * _COARSEST, smallest_epsilon)
+    usable = usable & (largest < _LARGEST)
+    largest_cost = tl.minimum(tl.maximum(largest, _SMALLEST), _LARGEST).to(dtype)
+    smallest_epsilon = (largest_cost.to(tl.float64) * real(resolution_bits, tl.float64)).to(dtype)
+    coarsest = tl.maximum(largest_cost * _COARSEST, smallest_epsilon)
 
     # Only differences between prices matter; without this they would grow from start to start.
     start_prices += row * size
@@ -457,12 +473,12 @@ def _match(
                     bids += tl.minimum(waiting, _PERSONS)
                     head, waiting, dummies = _bid_at_once(
                         persons, objects, price, owner, partner, queue, head, waiting, dummies, m, width, epsilon,
-                        _PERSONS, _OBJECTS,
+                        SQUARED, _PERSONS, _OBJECTS,
                     )  # fmt: skip
                 elif waiting > 0:
                     head, waiting, dummies, bids = _bid_in_a_chain(
                         persons, objects, price, owner, partner, queue, head, waiting, dummies, bids, limit, m, width,
-                        epsilon, _CHAIN,
+                        epsilon, SQUARED, _CHAIN,
                     )  # fmt: skip
                 else:
                     bids += dummies
@@ -473,7 +489,7 @@ def _match(
                 _assign_the_rest(owner, partner, queue, n, m, _LINE)
                 finished = best_bound >= proof_wanted
         bound, lowest, cost, waiting = _measure(
-            persons, objects, price, partner, queue, n, m, width, finer, _MEASURED, _OBJECTS, _LINE
+            persons, objects, price, partner, queue, n, m, width, finer, SQUARED, _MEASURED, _OBJECTS, _LINE
         )
         best_bound = tl.maximum(best_bound, bound)
         gap = tl.maximum(cost - best_bound, 0.0)
@@ -527,7 +543,10 @@ def _match(
 
 
 @triton.jit
-def _gradient(a, b, assignment, grad_mean, grad_a, grad_b, size_a, size_b, BLOCK: tl.constexpr):
+def _gradient(
+    a, b, assignment, grad_mean, grad_a, grad_b, size_a, size_b,
+    SQUARED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """A tile of `a`. No two points have one partner, so that the stores to `grad_b` do not collide."""
     tiles = tl.cdiv(size_a, BLOCK)
     row = (tl.program_id(0) // tiles).to(tl.int64)
@@ -540,9 +559,13 @@ def _gradient(a, b, assignment, grad_mean, grad_a, grad_b, size_a, size_b, BLOCK
     dx = tl.load(a + at_a, mask=matched, other=0.0) - tl.load(b + at_b, mask=matched, other=0.0)
     dy = tl.load(a + at_a + 1, mask=matched, other=0.0) - tl.load(b + at_b + 1, mask=matched, other=0.0)
     dz = tl.load(a + at_a + 2, mask=matched, other=0.0) - tl.load(b + at_b + 2, mask=matched, other=0.0)
-    distance = _root(dx * dx + dy * dy + dz * dz)
-    apart = distance > 0
-    scale = tl.where(apart, tl.load(grad_mean + row) / tl.where(apart, distance, 1.0), 0.0)
+    grad = tl.load(grad_mean + row)
+    if SQUARED:
+        scale = tl.where(matched, 2 * grad, 0.0)
+    else:
+        distance = _root(dx * dx + dy * dy + dz * dz)
+        apart = distance > 0
+        scale = tl.where(apart, grad / tl.where(apart, distance, 1.0), 0.0)
     tl.store(grad_a + at_a, dx * scale, mask=inside)
     tl.store(grad_a + at_a + 1, dy * scale, mask=inside)
     tl.store(grad_a + at_a + 2, dz * scale, mask=inside)
@@ -560,6 +583,7 @@ def earth_mover_distance(
     known_cost: Tensor,
     enough: Tensor,
     tolerance: float,
+    squared: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """As the operator."""
     name = "earth_mover_distance"
@@ -571,7 +595,8 @@ def earth_mover_distance(
     count_bad_sets(name, a, b, a_lengths, b_lengths, smallest=1)
     if count:
         width = max(_CHAIN.value, triton.next_power_of_2(max(size_a, size_b)))
-        counters = (("start.prices", "finite"), ("start.cost", "finite"), ("a", "extent"))
+        extent = "extent of squares" if squared else "extent"
+        counters = (("start.prices", "finite"), ("start.cost", "finite"), ("a", extent))
         launch(
             _match, count, a, b, a_lengths, b_lengths, prices, known_cost, enough,
             cost, assignment, bound, finished, final_prices,
@@ -579,14 +604,14 @@ def earth_mover_distance(
             *(errors.counter(a, name, argument, kind) for argument, kind in counters),
             size_a, size_b, width,
             bits_of(tolerance), bits_of(_auction.RESOLUTION[a.dtype.itemsize]), _auction.BIDS_PER_PERSON,
-            warps=_WARPS, registers=_REGISTERS[a.dtype],
+            squared, warps=_WARPS, registers=_REGISTERS[a.dtype],
         )  # fmt: skip
-    errors.settle(a, lambda: _checks.check_transport(a, b, a_lengths, b_lengths, prices, known_cost))
+    errors.settle(a, lambda: _checks.check_transport(a, b, a_lengths, b_lengths, prices, known_cost, squared))
     return cost, assignment, bound, finished.view(torch.bool), final_prices
 
 
 def earth_mover_distance_backward(
-    a: Tensor, b: Tensor, assignment: Tensor, grad_mean: Tensor
+    a: Tensor, b: Tensor, assignment: Tensor, grad_mean: Tensor, squared: bool
 ) -> tuple[Tensor, Tensor]:
     """As the operator."""
     grad_a, grad_b = torch.zeros_like(a), torch.zeros_like(b)
@@ -594,5 +619,5 @@ def earth_mover_distance_backward(
         block = 256
         programs = a.shape[0] * triton.cdiv(a.shape[1], block)
         sizes = a.shape[1], b.shape[1]
-        launch(_gradient, programs, a, b, assignment, grad_mean, grad_a, grad_b, *sizes, block)
+        launch(_gradient, programs, a, b, assignment, grad_mean, grad_a, grad_b, *sizes, squared, block)
     return grad_a, grad_b
