@@ -5,13 +5,14 @@ from __future__ import annotations
 import importlib.util
 import io
 import itertools
-import json
 import re
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import trimesh
+
+from train.data import gltf
 
 # Options of a texture in an MTL file, and how many values each takes at most; those of -o, -s and -t are numbers.
 _OPTIONS = {
@@ -106,15 +107,12 @@ def _colours(words: list[list[str]]) -> np.ndarray:
 
 def read_gltf(content: bytes, files: Any) -> trimesh.Scene:
     """Reads a GLB or glTF file; one compressed with Draco needs the package DracoPy."""
-    is_binary = content[:4] == b"glTF"
-    if _DRACO.encode() in content and importlib.util.find_spec("DracoPy") is None:
-        length = int.from_bytes(content[12:16], "little")
-        described = json.loads(content[20 : 20 + length] if is_binary else content)
-        if _DRACO in described.get("extensionsRequired", ()):
-            raise ValueError(
-                "its geometry is compressed with Draco: pip install DracoPy, or save it uncompressed"
-            )
-    return _load(content, "glb" if is_binary else "gltf", files)
+    required = gltf.described(content).get("extensionsRequired", ())
+    if _DRACO in required and importlib.util.find_spec("DracoPy") is None:
+        raise ValueError(
+            "its geometry is compressed with Draco: pip install DracoPy, or save it uncompressed"
+        )
+    return _load(gltf.plain(content, files.get), "glb", files)
 
 
 def _load(content: bytes, kind: str, files: Any) -> trimesh.Scene:
