@@ -58,6 +58,8 @@ def plain(content: bytes, file_content: Callable[[str], bytes]) -> bytes:
             document.make_dense(accessor)
     for material in scene.get("materials", ()):
         _without_specular(material)
+        if "trimesh" in scene.get("asset", {}).get("generator", ""):
+            _without_default_grey(material)
     for mesh in scene.get("meshes", ()):
         for primitive in mesh["primitives"]:
             if _DRACO not in primitive.get("extensions", {}):
@@ -103,6 +105,14 @@ def _without_specular(material: dict[str, Any]) -> None:
     if older is not None and "pbrMetallicRoughness" not in material:
         names = {"diffuseFactor": "baseColorFactor", "diffuseTexture": "baseColorTexture"}
         material["pbrMetallicRoughness"] = {new: older[old] for old, new in names.items() if old in older}
+
+
+def _without_default_grey(material: dict[str, Any]) -> None:
+    """trimesh multiplies the pictures that it exports by the grey that it gives to materials without a colour."""
+    colours = material.get("pbrMetallicRoughness", {})
+    factor = colours.get("baseColorFactor")
+    if "baseColorTexture" in colours and factor and np.allclose(factor[:3], 0.4, atol=0.002):
+        del colours["baseColorFactor"]
 
 
 class _Document:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from train.data import gltf
+from train.data import gltf, obj_text, ply_text
 
 # Options of a texture in an MTL file, and how many values each takes at most; those of -o, -s and -t are numbers.
 _OPTIONS = {
@@ -24,7 +24,8 @@ _DRACO = "KHR_draco_mesh_compression"
 
 def read_obj(content: bytes, files: Any) -> trimesh.Scene:
     """Reads an OBJ file in any encoding: only names and comments can have letters that are not ASCII."""
-    return _load(_as_utf8(content), "obj", files)
+    content, libraries = obj_text.plain(content)
+    return _load(content, "obj", obj_text.Libraries(files, libraries))
 
 
 def clean_mtl(content: bytes) -> bytes:
@@ -34,8 +35,14 @@ def clean_mtl(content: bytes) -> bytes:
         >>> clean_mtl(b"newmtl a\\nmap_Kd -s 2 2 2 -clamp on dark red.png\\n")
         b'newmtl a\\nmap_Kd dark red.png\\n'
     """
-    lines = _as_utf8(content).decode().splitlines()
-    return "".join(f"{_without_options(line)}\n" for line in lines).encode()
+    lines = obj_text.as_text(content).decode().replace("\t", " ").split("\n")
+    return "".join(f"{_without_options(_grey(line.strip()))}\n" for line in lines if line.strip()).encode()
+
+
+def _grey(line: str) -> str:
+    """A colour of one number is grey."""
+    words = line.split()
+    return " ".join([*words, words[1], words[1]]) if len(words) == 2 and words[0] == "Kd" else line
 
 
 def _without_options(line: str) -> str:
@@ -61,7 +68,7 @@ def _is_number(word: str) -> bool:
 
 def read_ply(content: bytes, files: Any) -> trimesh.Scene:
     """Reads a PLY file; texture coordinates without a picture do not hide the colours of its vertices."""
-    header, end, body = content.partition(b"end_header")
+    header, end, body = ply_text.plain(content).partition(b"end_header")
     if b"TextureFile" not in header:
         header = re.sub(
             rb"(?m)^(property .*\b)(s|t|u|v|texture_u|texture_v|texcoord)[ \t]*(\r?)$", rb"\1_\2\3", header
@@ -71,7 +78,7 @@ def read_ply(content: bytes, files: Any) -> trimesh.Scene:
 
 def read_off(content: bytes, files: Any) -> trimesh.Scene:
     """Reads an OFF file with the colours of its vertices (COFF) or faces."""
-    text = re.sub(r"#.*", "", _as_utf8(content).decode())
+    text = re.sub(r"#.*", "", obj_text.as_text(content).decode())
     lines = [line.split() for line in text.splitlines() if line.strip()]
     match = re.fullmatch(r"(C?)OFF", lines[0][0], re.IGNORECASE)
     if not match:
@@ -121,11 +128,20 @@ def _load(content: bytes, kind: str, files: Any) -> trimesh.Scene:
     return found
 
 
-def _as_utf8(content: bytes) -> bytes:
-    return content if content.isascii() else content.decode("utf-8", errors="replace").encode()
+def read_stl(content: bytes, files: Any) -> trimesh.Scene:
+    """Reads an STL file, in text or binary, which must be whole."""
+    is_text = content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
+    if is_text:
+        if b"endsolid" not in content[-4096:].lower():
+            raise ValueError("the file ends early: endsolid is missing")
+    elif len(content) < 84 + 50 * (count := int.from_bytes(content[80:84], "little")) or not count:
+        held = max(len(content) - 84, 0) // 50
+        raise ValueError(f"neither text nor a whole binary file: it says {count} triangles and holds {held}")
+    return _load(content, "stl_ascii" if is_text else "stl", files)
 
 
 READERS: dict[str, Callable[[bytes, Any], trimesh.Scene]] = {
     ".obj": read_obj, ".ply": read_ply, ".off": read_off, ".glb": read_gltf, ".gltf": read_gltf,
+    ".stl": read_stl,
 }  # fmt: skip
 """Suffix -> reader: (content of the file, resolver of the files that it names) -> scene."""

@@ -47,6 +47,8 @@ _TEXTURE_SIZE = 512
 _LARGEST_FILE = 256 << 20
 """Bytes: about ten million faces, which take 5 GB of memory to read. A mesh of three million takes 1.7 GB."""
 
+_LFS = b"version https://git-lfs"
+
 _MAX_STRETCH = 0.3  # natural logarithm of the factor along an axis
 _FLAT = 1e-5  # extent over the diagonal
 
@@ -317,6 +319,9 @@ def load_surface(
         files = _Files(path, Path(root) if root else path.parent.parent)
         suffix = path.suffix.lower()
         with path.open("rb") as file:
+            if file.read(len(_LFS)) == _LFS:
+                raise MeshError("a pointer of Git LFS instead of the file: fetch it with git lfs pull")
+            file.seek(0)
             if suffix in game_meshes.READERS:
                 scene = game_meshes.READERS[suffix](file.read(), files.get)
             elif suffix in mesh_text.READERS:
@@ -329,7 +334,7 @@ def load_surface(
     except Exception as error:  # each format's reader has its own exceptions
         raise MeshError(f"cannot be read ({type(error).__name__}: {error})") from error
     if not parts:
-        raise MeshError("no faces")
+        raise MeshError("no faces: points and lines have no surface to render")
     surface = _joined(parts)
     corners = surface.vertices[surface.faces]
     if not np.isfinite(corners).all():
