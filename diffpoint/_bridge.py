@@ -111,7 +111,9 @@ def _owned(results: Tensor | tuple[Tensor, ...]) -> Any:
     """The same memory, but no views: torch forbids to change those in place that an autograd function returns."""
     if not isinstance(results, Tensor):
         return tuple(map(_owned, results))
-    return results.new_empty(0).set_(results) if results._is_view() else results
+    if not results._is_view():
+        return results
+    return results.new_empty(0).set_(results)  # pyright: ignore[reportArgumentType]
 
 
 interpreted = False
