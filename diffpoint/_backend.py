@@ -62,6 +62,25 @@ def home_directory() -> Iterator[bool]:
 
 
 @contextlib.contextmanager
+def default_types() -> Iterator[None]:
+    """Numbers in kernels are of 32 bits inside, whatever a host program has chosen when it started the compiler."""
+    backend = import_backend()
+    runtime = backend.lang.impl.get_runtime()
+    before = getattr(runtime, "default_fp", None), getattr(runtime, "default_ip", None)
+    wanted = backend.f32, backend.i32
+    if None in before or before == wanted:
+        yield
+        return
+    try:
+        runtime.set_default_fp(wanted[0])
+        runtime.set_default_ip(wanted[1])
+        yield
+    finally:
+        runtime.set_default_fp(before[0])
+        runtime.set_default_ip(before[1])
+
+
+@contextlib.contextmanager
 def without_warnings() -> Iterator[None]:
     """Hides the compiler's warnings of its own code, which would end a program run with `python -W error`."""
     with warnings.catch_warnings():

@@ -94,17 +94,26 @@ def _on_any_device(name: str, function: Callable, strided: bool) -> Callable:
                 with _device(elsewhere):
                     results = kernel(*arguments)
                 if results is not NotImplemented:
-                    return results
+                    return _owned(results)
         here = [a.cpu() if isinstance(a, Tensor) else a for a in arguments] if elsewhere else arguments
         with _checks.full_precision(_NUMBER):
             results = function(*here)
         if not elsewhere:
-            return results
+            return _owned(results)
         if isinstance(results, Tensor):
             return results.to(elsewhere[0])
         return tuple(r.to(elsewhere[0]) for r in results)
 
     return run
+
+
+def _owned(results: Tensor | tuple[Tensor, ...]) -> Any:
+    """The same memory, but no views: torch forbids to change those in place that an autograd function returns."""
+    if not isinstance(results, Tensor):
+        return tuple(map(_owned, results))
+    if not results._is_view():
+        return results
+    return results.new_empty(0).set_(results)  # pyright: ignore[reportArgumentType]
 
 
 interpreted = False

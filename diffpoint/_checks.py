@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch._C import _functorch  # pyright: ignore[reportAttributeAccessIssue]
+from torch._subclasses.fake_tensor import FakeTensor
 
 from diffpoint import _auction
 
@@ -27,8 +28,12 @@ def fail(function: str, argument: str, expected: str, got: str, hint: str = "") 
 
 
 def readable(*values: Tensor) -> bool:
-    """Whether Python can read values of these: not while torch traces, nor where `torch.vmap` maps over them."""
-    if torch.compiler.is_compiling():
+    """Whether Python can read values of these.
+
+    Not while torch traces, nor of tensors that have none (on the device meta, or fake), nor where `torch.vmap` maps
+    over them.
+    """
+    if torch.compiler.is_compiling() or any(v.is_meta or isinstance(v, FakeTensor) for v in values):
         return False
     return _functorch.maybe_current_level() is None or not any(_is_mapped(v) for v in values)
 
@@ -76,8 +81,13 @@ def check_tensor(function: str, name: str, value: Any, shape: tuple[int | str, .
 
 def _kind(value: Any) -> str:
     """What a value that is no tensor is, as the end of a message."""
-    hint = " Convert it with torch.from_numpy." if type(value).__name__ == "ndarray" else ""
-    return f"{type(value).__name__}.{hint}"
+    kind = type(value).__name__
+    hint = " Convert it with torch.from_numpy." if kind == "ndarray" else ""
+    if isinstance(value, (list, tuple)):
+        inside = any(isinstance(each, Tensor) for each in value)
+        hint = " Pad and stack it: torch.nn.utils.rnn.pad_sequence(..., batch_first=True), with lengths."
+        hint = hint if inside else " Convert it with torch.tensor."
+    return f"{kind}.{hint}"
 
 
 def check_device(function: str, name: str, value: Tensor, like: Tensor) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from diffpoint._backend import without_warnings
+from diffpoint._backend import default_types, without_warnings
 
 # What a missing attribute or a changed signature raises, before anything has run. An error of the kernel itself is a
 # RuntimeError and is not caught: a kernel that adds to its outputs must not run twice.
@@ -55,7 +55,7 @@ class FastCall:
         if program is self.program and self._try(self._run, arguments):
             return
         detached = [a.detach() if isinstance(a, Tensor) else a for a in arguments]
-        with without_warnings():
+        with without_warnings(), default_types():
             self.kernel(*detached)
             self.program = None
             if self.compatible and self._try(self._prepare, program, detached):

@@ -105,14 +105,18 @@ class PinholeCamera:
         sizes = _sizes(name, height, width)
         focal_px = _conversions.focal_of(name, focal_px, fov_y_deg, sizes["height"])
         at = _vector("eye", eye)
-        at, towards, upward = torch.broadcast_tensors(
-            at, _vector("target", target, at), _vector("up", up, at)
-        )
-        forward = towards - at
+        given = at, _vector("target", target, at), _vector("up", up, at)
+        for argument, vectors in zip(("eye", "target", "up"), given, strict=True):
+            _checks.check_finite(name, argument, vectors.detach())
+        try:
+            at, towards, upward = torch.broadcast_tensors(*given)
+        except RuntimeError:
+            shapes = ", ".join(str(tuple(each.shape)) for each in given)
+            raise _checks.fail(name, "eye", "fit 'target' and 'up' in shape", shapes) from None
+        forward, upward = _in_range(towards - at), _in_range(upward)
         right = torch.linalg.cross(forward, upward)
-        if _checks.readable(forward, right) and (
-            bool((forward.norm(dim=-1) == 0).any()) or bool((right.norm(dim=-1) < 1e-9).any())
-        ):
+        sine = right.norm(dim=-1) / (forward.norm(dim=-1) * upward.norm(dim=-1))
+        if _checks.readable(sine) and not bool((sine >= 4 * torch.finfo(at.dtype).eps).all()):
             raise _checks.fail(
                 "PinholeCamera.look_at",
                 "up",
@@ -379,9 +383,24 @@ def _inverse(name: str, matrix: Tensor) -> Tensor:
     return inverse
 
 
+def _in_range(vectors: Tensor) -> Tensor:
+    """Vectors with the same directions, of which the squares of no components overflow or vanish."""
+    largest = vectors.detach().abs().amax(-1, keepdim=True)
+    usual = (largest == 0) | ((largest > 1e-12) & (largest < 1e12))
+    return vectors / torch.where(usual, 1, largest)
+
+
 def _vector(name: str, value, like: Tensor | None = None) -> Tensor:
+    if isinstance(value, (list, tuple)) and any(isinstance(each, Tensor) for each in value):
+        # torch.tensor would cut them off from their gradients.
+        value = torch.stack([torch.as_tensor(each, dtype=torch.float32) for each in value])
     if not isinstance(value, Tensor):
-        value = torch.tensor(value, dtype=torch.float32) if like is None else like.new_tensor(value)
+        try:
+            value = torch.tensor(value, dtype=torch.float32) if like is None else like.new_tensor(value)
+        except (TypeError, ValueError, RuntimeError):
+            raise TypeError(
+                f"PinholeCamera.look_at: '{name}' must be three numbers or a tensor (..., 3); got {value!r}."
+            ) from None
     value = _checks.check_tensor("PinholeCamera.look_at", name, value, ("*", 3))
     return value if like is None else value.to(like)
 

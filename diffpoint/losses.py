@@ -64,7 +64,7 @@ def front_sets(
         >>> sets.predicted_lengths.tolist(), sets.observed_lengths.tolist()
         ([[1]], [[1]])
     """
-    return _front_sets(points, camera, depth, visibility)[0]
+    return _front_sets("front_sets", points, camera, depth, visibility)[0]
 
 
 class _Counts(NamedTuple):
@@ -79,10 +79,10 @@ class _Counts(NamedTuple):
 
 
 def _front_sets(
-    points: Tensor, camera: PinholeCamera, depth: Tensor, visibility: Method
+    function: str, points: Tensor, camera: PinholeCamera, depth: Tensor, visibility: Method
 ) -> tuple[FrontSets, _Counts | None]:
     """The sets, and what is known of their sizes; None where sizes must not depend on values (see `readable`)."""
-    batch, views = check_maps("front_sets", points, camera, depth)
+    batch, views = check_maps(function, points, camera, depth)
     sample = sample_view(points, visible_points(points, camera, method=visibility))
     seen = sample.points.expand(batch, views, -1, 3)
     lengths = sample.lengths.expand(batch, views)
@@ -165,7 +165,7 @@ def _front_terms(
     visibility: Method,
 ) -> tuple[FrontTerms, _Counts | None]:
     _checks.check_choice(function, "distance", distance, ("chamfer", "emd"))
-    sets, counts = _front_sets(points, camera, depth, visibility)
+    sets, counts = _front_sets(function, points, camera, depth, visibility)
     if points.shape[1] == 0 and points.shape[0]:
         raise _checks.fail(function, "points", "hold at least one point", str(tuple(points.shape)))
     kept = sets.observed_lengths > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -104,6 +106,7 @@ def _farthest(
     if chosen.numel() == 0 or size == 0:
         return chosen
     counts = torch.minimum(counts, lengths)
+    points = _in_range(points, lengths)
     if size < _LARGE:
         axes = lanes(points)
         distance = _unset_distance(points, lengths, axes[0][0].numel())
@@ -119,6 +122,18 @@ def _farthest(
     chosen_by = counts, starts, chosen
     _bridge.launch("sampling", "farthest_blocks", points.dtype, *sets, distance, *largest, *chosen_by)
     return chosen
+
+
+def _in_range(points: Tensor, lengths: Tensor) -> Tensor:
+    """The points; times a power of two, which chooses the same ones, where squared distances overflow or vanish."""
+    largest = max(abs(float(extreme)) for extreme in torch.aminmax(points))
+    if not 1e-12 < largest < 1e18:
+        padding = torch.arange(points.shape[1]) >= lengths[:, None]
+        points = points.masked_fill(padding[..., None], 0)
+        largest = float(points.abs().max())
+        if largest > 0 and not 1e-12 < largest < 1e18:
+            points = torch.ldexp(points.double(), torch.tensor(-math.frexp(largest)[1])).to(points.dtype)
+    return points
 
 
 def _unset_distance(points: Tensor, lengths: Tensor, size: int) -> Tensor:

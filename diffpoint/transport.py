@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from diffpoint import _auction, _bridge, _checks
-from diffpoint.distances import paired_sets
 from diffpoint.blocks import LANES
+from diffpoint.distances import paired_sets
 from diffpoint.sampling import lanes
 
 _ROUND = 32  # persons for whom all objects are scanned at the same prices; at most 64

@@ -347,3 +347,35 @@ def test_pytorch3ds_matrices_are_broadcast():
     two = torch.tensor([[0.0, 0, 2], [0, 0, 3]])
     camera = dp.PinholeCamera.from_pytorch3d(EYE3[None], two, EYE3, 4, 4)
     assert camera.position.tolist() == [[0.0, 0, -2], [0, 0, -3]]
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-10, 1.0, 1e10, 1e20])
+def test_look_at_in_any_unit(scale: float) -> None:
+    eye, up = (scale, 2 * scale, scale), (0.0, 1 / scale, 0.0)
+    camera, same = (
+        dp.PinholeCamera.look_at(at, focal_px=4.0, height=4, width=4, up=towards)
+        for at, towards in ((eye, up), ((1.0, 2.0, 1.0), (0.0, 1.0, 0.0)))
+    )
+    torch.testing.assert_close(camera.cam_from_world[:3, :3], same.cam_from_world[:3, :3])
+
+
+def test_look_at_says_what_does_not_fit() -> None:
+    along = torch.tensor([0.3, 0.5, 0.7])
+    sizes = {"focal_px": 4.0, "height": 4, "width": 4}
+    with pytest.raises(ValueError, match="'up' must differ in direction"):  # parallel but for rounding
+        dp.PinholeCamera.look_at(3.3 * along, up=1.7 * along, **sizes)
+    with pytest.raises(
+        ValueError, match=r"'eye' must fit 'target' and 'up' in shape; got \(5, 3\), \(4, 3\)"
+    ):
+        dp.PinholeCamera.look_at(torch.rand(5, 3), torch.zeros(4, 3), **sizes)
+    with pytest.raises(TypeError, match="'target' must be three numbers or a tensor"):
+        dp.PinholeCamera.look_at((0, 0, 1), "origin", **sizes)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="'eye' must be finite"):
+        dp.PinholeCamera.look_at((0, float("nan"), 1), **sizes)
+
+
+def test_look_at_passes_gradients_to_tensors_in_a_tuple() -> None:
+    distance = torch.tensor(2.0, requires_grad=True)
+    camera = dp.PinholeCamera.look_at((0, 0, distance), focal_px=4.0, height=4, width=4)  # pyright: ignore[reportArgumentType]
+    camera.position.sum().backward()
+    assert distance.grad == pytest.approx(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -334,3 +335,25 @@ def test_photographs_are_turned_as_the_camera_was_held(tmp_path: Path) -> None:
     result = read_images([tmp_path / "photo.jpg"], size=40)[0, 0]
     assert result[12:28, 32:].max() < 0.1  # the dark end, which was on top, is on the right
     assert result[12:28, :28].min() > 0.9
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes of a POSIX shell")
+@pytest.mark.parametrize(
+    ("output", "expected", "said"), [("pipe", 141, b""), ("/dev/full", 2, b"No space left"), (None, 0, b"")]
+)
+def test_output_that_cannot_be_written(output: str | None, expected: int, said: bytes) -> None:
+    command = [sys.executable, "-m", "train", "--help"]
+    if output is None:
+        command = ["sh", "-c", '"$0" -m train --help >&-', sys.executable]
+    if output == "pipe":
+        reader, writer = os.pipe()
+        os.close(reader)
+    else:
+        writer = os.open(output or os.devnull, os.O_WRONLY)
+    try:
+        done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
+    finally:
+        os.close(writer)
+    assert done.returncode == expected
+    assert said in done.stderr
+    assert said or not done.stderr

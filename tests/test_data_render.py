@@ -125,7 +125,7 @@ def test_texture_lies_as_its_coordinates_say(caster):
     surface = Surface(
         np.array([(-0.4, -0.4, 0), (0.4, -0.4, 0), (0.4, 0.4, 0), (-0.4, 0.4, 0)]),
         np.array([(0, 1, 2), (0, 2, 3)]),
-        np.zeros((2, 3, 3), np.float32),
+        np.ones((2, 3, 3), np.float32),
         np.zeros(2, int),
         np.array([[(0, 0), (1, 0), (1, 1)], [(0, 0), (1, 1), (0, 1)]], np.float32),
         (texture.astype(np.uint8),),

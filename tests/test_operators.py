@@ -1,5 +1,7 @@
 """The ops as torch operators: registered, traceable, on any device, and refusing a second derivative by name."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch._library.custom_ops import OPDEFS
@@ -253,3 +255,59 @@ def test_autocast_changes_no_bit():
     for x, y in zip(plain, cast, strict=True):
         assert x.dtype == y.dtype
         assert torch.equal(x, y)
+
+
+def _results(device: str) -> dict[str, Any]:
+    """Results of all ops whose sizes do not depend on values."""
+    generator = torch.Generator().manual_seed(0)
+    a, b = ((torch.rand(2, 30, 3, generator=generator) - 0.5).to(device).requires_grad_() for _ in range(2))
+    camera = dp.PinholeCamera.look_at((0, 0, -2), focal_px=16.0, height=12, width=10).to(device)
+    depth = torch.full((2, 1, 12, 10), 2.0, device=device)
+    return {
+        "splat": dp.splat_depth(a, camera),
+        "soft_splat": dp.soft_splat(a, camera),
+        "project": dp.project(a, camera),
+        "unproject": dp.unproject(depth, camera),
+        "reproject": dp.reproject(depth, camera, camera),
+        "visible": (dp.visible_points(a, camera, method="horizon"),),
+        "nearest": dp.nearest(a, b),
+        "chamfer": dp.chamfer_distance(a, b, squared=True),
+        "knn": dp.knn(a, b, 3),
+        "emd": dp.earth_mover_distance(a, b),
+        "approxmatch": (dp.approxmatch(a, b),),
+        "f_score": dp.f_score(a, b, 0.1),
+        "farthest": (dp.farthest_point_sample(a, 4),),
+    }
+
+
+def test_results_can_be_changed_in_place() -> None:
+    """As in `depth[depth.isinf()] = 0`, which torch forbids on views that an operator returns."""
+    for name, results in _results("cpu").items():
+        for result in results:
+            result.zero_()
+            assert not result.any(), name
+    points = torch.tensor([[[0.0, 0, 0], [0.1, 0.1, 0.5]]], requires_grad=True)
+    camera = dp.PinholeCamera.look_at((0, 0, -2), focal_px=16.0, height=12, width=10)
+    depth = dp.splat_depth(points, camera).depth
+    depth[depth.isinf()] = 0
+    depth.sum().backward()
+    assert points.grad is not None
+    assert points.grad[..., 2].tolist() == [[1, 1]]
+
+
+def test_tensors_without_values() -> None:
+    for name, results in _results("cpu").items():
+        for real, meta in zip(results, _results("meta")[name], strict=True):
+            assert (meta.device.type, meta.shape, meta.dtype) == ("meta", real.shape, real.dtype), name
+
+
+@pytest.mark.parametrize("size", [40, 5000])
+@pytest.mark.parametrize("scale", [2.0**-80, 2.0**66])
+def test_farthest_points_where_squares_leave_the_range(size: int, scale: float) -> None:
+    points = torch.rand(2, size, 3, generator=torch.Generator().manual_seed(0)) + 1
+    lengths = torch.tensor([size, 20])
+    expected = dp.farthest_point_sample(points, 9, lengths=lengths)
+    assert torch.equal(dp.farthest_point_sample(points * scale, 9, lengths=lengths), expected)
+    if scale > 1:
+        with pytest.raises(ValueError, match="approxmatch: 'a' must span less than 1e18"):
+            dp.approxmatch(points[:, :9] * scale, points[:, :9].flip(1) * scale)

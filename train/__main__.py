@@ -325,19 +325,41 @@ class Demo:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; a user's mistake becomes one line on stderr and exit code 2."""
-    arguments = renamed_options(sys.argv[1:] if arguments is None else arguments)
+    # Daemons close their outputs, for which Python has None; libraries ask it whether it is a terminal.
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     try:
-        command = _parse(arguments)
-        return command.run() or 0
+        try:
+            return _run(renamed_options(sys.argv[1:] if arguments is None else arguments))
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # who reads our output, such as `head`, has seen enough
+        _drop_output()
+        return 128 + 13  # as a shell reports SIGPIPE
     except UserError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except OSError as error:  # no permission, no space, a name that is too long: the system's words are clear
         print(f"error: {error}", file=sys.stderr)
+        _drop_output()
         return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+
+
+def _run(arguments: list[str]) -> int:
+    return _parse(arguments).run() or 0
+
+
+def _drop_output() -> None:
+    """Sends what is still to be printed nowhere, if it cannot be printed: Python would complain at its end."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def _parse(arguments: list[str]) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import io
-import json
 import re
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 import trimesh
 from trimesh.visual import ColorVisuals
 
+from train.data import gltf, obj_text, ply_text
 from train.data.polygons import clip_concave, triangulate
 
 # Options of a texture in an MTL file, and how many values each takes at most; those of -o, -s and -t are numbers.
@@ -20,21 +20,21 @@ _OPTIONS = {
     "-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-mm": 2, "-bm": 1, "-o": 3, "-s": 3, "-t": 3, "-texres": 1,
     "-boost": 1, "-imfchan": 1, "-type": 1,
 }  # fmt: skip
-_POLYGON = re.compile(rb"^f((?:[ \t]+-?\d+(?:/-?\d*){0,2}){4,})[ \t]*$", re.MULTILINE)
+_POLYGON = re.compile(rb"^f((?: +\d+(?:/\d*){0,2}){4,}) *$", re.MULTILINE)
 """A face of an OBJ file with more than three corners."""
 
-_VERTEX = re.compile(rb"^v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
+_VERTEX = re.compile(rb"^v +(\S+) +(\S+) +(\S+)", re.MULTILINE)
 _DRACO = "KHR_draco_mesh_compression"
 
 
 def read_obj(content: bytes, files: Any) -> trimesh.Scene:
     """Reads an OBJ file in any encoding: only names and comments can have letters that are not ASCII."""
-    return _load(_in_triangles(_as_utf8(content)), "obj", files)
+    content, libraries = obj_text.plain(content)
+    return _load(_in_triangles(content), "obj", obj_text.Libraries(files, libraries))
 
 
 def _in_triangles(content: bytes) -> bytes:
-    """An OBJ file whose concave faces are written as triangles; the others are left to trimesh, which makes fans."""
-    content = content.replace(b"\r\n", b"\n").replace(b"\\\n", b"")
+    """A plain OBJ file whose concave faces are written as triangles; of the others trimesh makes fans."""
     places = [face.span(1) for face in _POLYGON.finditer(content)]
     if not places:
         return content
@@ -45,11 +45,7 @@ def _in_triangles(content: bytes) -> bytes:
         return content
     faces = [content[start:end] for start, end in places]
     sizes = np.array([len(face.split()) for face in faces])
-    indices = np.array(re.sub(rb"/\S*", b"", b"".join(faces)).split()).astype(int)
-    # Negative numbers count back from the last vertex that is written before the face.
-    written = np.fromiter((vertex.start() for vertex in _VERTEX.finditer(content)), int)
-    written_before = np.searchsorted(written, [start for start, _ in places])
-    indices = np.where(indices > 0, indices - 1, indices + np.repeat(written_before, sizes))
+    indices = np.array(re.sub(rb"/\S*", b"", b"".join(faces)).split()).astype(int) - 1
     pieces, at = [], 0
     for number, triangles in sorted(clip_concave(vertices, indices, sizes).items()):
         (start, end), corners = places[number], faces[number].split()
@@ -66,8 +62,14 @@ def clean_mtl(content: bytes) -> bytes:
         >>> clean_mtl(b"newmtl a\\nmap_Kd -s 2 2 2 -clamp on dark red.png\\n")
         b'newmtl a\\nmap_Kd dark red.png\\n'
     """
-    lines = _as_utf8(content).decode().splitlines()
-    return "".join(f"{_without_options(line)}\n" for line in lines).encode()
+    lines = obj_text.as_text(content).decode().replace("\t", " ").split("\n")
+    return "".join(f"{_without_options(_grey(line.strip()))}\n" for line in lines if line.strip()).encode()
+
+
+def _grey(line: str) -> str:
+    """A colour of one number is grey."""
+    words = line.split()
+    return " ".join([*words, words[1], words[1]]) if len(words) == 2 and words[0] == "Kd" else line
 
 
 def _without_options(line: str) -> str:
@@ -93,7 +95,7 @@ def _is_number(word: str) -> bool:
 
 def read_ply(content: bytes, files: Any) -> trimesh.Scene:
     """Reads a PLY file; texture coordinates without a picture do not hide the colours of its vertices."""
-    header, end, body = content.partition(b"end_header")
+    header, end, body = ply_text.plain(content).partition(b"end_header")
     if b"TextureFile" not in header:
         header = re.sub(
             rb"(?m)^(property .*\b)(s|t|u|v|texture_u|texture_v|texcoord)[ \t]*(\r?)$", rb"\1_\2\3", header
@@ -141,7 +143,7 @@ def _polygons_of_ply(mesh: trimesh.Trimesh) -> np.ndarray | Sequence[np.ndarray]
 
 def read_off(content: bytes, files: Any) -> trimesh.Scene:
     """Reads an OFF file with the colours of its vertices (COFF) or faces."""
-    text = re.sub(r"#.*", "", _as_utf8(content).decode())
+    text = re.sub(r"#.*", "", obj_text.as_text(content).decode())
     lines = [line.split() for line in text.splitlines() if line.strip()]
     match = re.fullmatch(r"(C?)OFF", lines[0][0], re.IGNORECASE)
     if not match:
@@ -176,15 +178,12 @@ def _colours(words: list[list[str]]) -> np.ndarray:
 
 def read_gltf(content: bytes, files: Any) -> trimesh.Scene:
     """Reads a GLB or glTF file; one compressed with Draco needs the package DracoPy."""
-    is_binary = content[:4] == b"glTF"
-    if _DRACO.encode() in content and importlib.util.find_spec("DracoPy") is None:
-        length = int.from_bytes(content[12:16], "little")
-        described = json.loads(content[20 : 20 + length] if is_binary else content)
-        if _DRACO in described.get("extensionsRequired", ()):
-            raise ValueError(
-                "its geometry is compressed with Draco: pip install DracoPy, or save it uncompressed"
-            )
-    return _load(content, "glb" if is_binary else "gltf", files)
+    required = gltf.described(content).get("extensionsRequired", ())
+    if _DRACO in required and importlib.util.find_spec("DracoPy") is None:
+        raise ValueError(
+            "its geometry is compressed with Draco: pip install DracoPy, or save it uncompressed"
+        )
+    return _load(gltf.plain(content, files.get), "glb", files)
 
 
 def _load(content: bytes, kind: str, files: Any) -> trimesh.Scene:
@@ -193,11 +192,20 @@ def _load(content: bytes, kind: str, files: Any) -> trimesh.Scene:
     return found
 
 
-def _as_utf8(content: bytes) -> bytes:
-    return content if content.isascii() else content.decode("utf-8", errors="replace").encode()
+def read_stl(content: bytes, files: Any) -> trimesh.Scene:
+    """Reads an STL file, in text or binary, which must be whole."""
+    is_text = content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
+    if is_text:
+        if b"endsolid" not in content[-4096:].lower():
+            raise ValueError("the file ends early: endsolid is missing")
+    elif len(content) < 84 + 50 * (count := int.from_bytes(content[80:84], "little")) or not count:
+        held = max(len(content) - 84, 0) // 50
+        raise ValueError(f"neither text nor a whole binary file: it says {count} triangles and holds {held}")
+    return _load(content, "stl_ascii" if is_text else "stl", files)
 
 
 READERS: dict[str, Callable[[bytes, Any], trimesh.Scene]] = {
     ".obj": read_obj, ".ply": read_ply, ".off": read_off, ".glb": read_gltf, ".gltf": read_gltf,
+    ".stl": read_stl,
 }  # fmt: skip
 """Suffix -> reader: (content of the file, resolver of the files that it names) -> scene."""

@@ -10,6 +10,7 @@ import io
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import trimesh
@@ -45,6 +46,8 @@ _TEXTURE_SIZE = 512
 
 _LARGEST_FILE = 256 << 20
 """Bytes: about ten million faces, which take 5 GB of memory to read. A mesh of three million takes 1.7 GB."""
+
+_LFS = b"version https://git-lfs"
 
 _MAX_STRETCH = 0.3  # natural logarithm of the factor along an axis
 _FLAT = 1e-5  # extent over the diagonal
@@ -316,6 +319,9 @@ def load_surface(
         files = _Files(path, Path(root) if root else path.parent.parent)
         suffix = path.suffix.lower()
         with path.open("rb") as file:
+            if file.read(len(_LFS)) == _LFS:
+                raise MeshError("a pointer of Git LFS instead of the file: fetch it with git lfs pull")
+            file.seek(0)
             if suffix in game_meshes.READERS:
                 scene = game_meshes.READERS[suffix](file.read(), files.get)
             elif suffix in mesh_text.READERS:
@@ -328,7 +334,7 @@ def load_surface(
     except Exception as error:  # each format's reader has its own exceptions
         raise MeshError(f"cannot be read ({type(error).__name__}: {error})") from error
     if not parts:
-        raise MeshError("no faces")
+        raise MeshError("no faces: points and lines have no surface to render")
     surface = _joined(parts)
     corners = surface.vertices[surface.faces]
     if not np.isfinite(corners).all():
@@ -376,7 +382,10 @@ def stretch(surface: Surface, rng: np.random.Generator) -> Surface:
 
 
 class _Files(FilePathResolver):
-    """Finds the files that a mesh names: beside it or elsewhere below a folder, with slashes of either kind."""
+    """Finds the files that a mesh names: beside it or elsewhere below a folder.
+
+    Names may have slashes of either kind, quotes, percent signs as in addresses, and letters of another case.
+    """
 
     def __init__(self, path: Path, root: Path) -> None:
         super().__init__(str(path))
@@ -400,16 +409,33 @@ class _Files(FilePathResolver):
         return mesh_text.clean_mtl(content) if name.lower().endswith(".mtl") else content
 
     def _read(self, name: str) -> bytes | None:
-        for candidate in (name, name.lstrip("/"), name.rpartition("/")[2]):
-            path = Path(self.parent, candidate).resolve()
-            if path.is_relative_to(self._root) and path.is_file():
-                return path.read_bytes()
+        plain = name.strip('"')
+        spelled = dict.fromkeys(
+            Path(self.parent, candidate).resolve()
+            for each in (name, plain, unquote(plain))
+            for candidate in (each, each.lstrip("/"), each.rpartition("/")[2])
+        )
+        for spell in (Path, _in_any_case):
+            for path in filter(None, map(spell, spelled)):
+                if path.is_relative_to(self._root) and path.is_file():
+                    return path.read_bytes()
         # FlightGear's paints: in this folder is one for each airline.
         paints = Path(self.parent).resolve().parent / "Textures"
         for path in sorted(paints.rglob(glob.escape(name.rpartition("/")[2]))):
             if path.is_relative_to(self._root) and path.is_file():
                 return path.read_bytes()
         return None
+
+
+def _in_any_case(path: Path) -> Path | None:
+    """A path that exists and differs in no more than the case of letters, which Windows does not mind."""
+    if path.exists():
+        return path
+    folder = _in_any_case(path.parent) if path.parent != path else None
+    if folder is None or not folder.is_dir():
+        return None
+    name = path.name.casefold()
+    return min((each for each in folder.iterdir() if each.name.casefold() == name), default=None)
 
 
 def _parts(scene: trimesh.Scene) -> list[Surface]:
@@ -428,10 +454,11 @@ def _parts(scene: trimesh.Scene) -> list[Surface]:
 
 
 def _coloured(mesh: trimesh.Trimesh, vertices: np.ndarray, faces: np.ndarray) -> Surface:
-    """Texture if there is one, else vertex or face colours, else the material's colour."""
+    """Texture if there is one, else vertex or face colours, else the material's colour; in glTF, their product."""
     visual = mesh.visual
     colours = np.full((len(faces), 3), 0.7)
     if isinstance(visual, TextureVisuals):
+        tint = _tint(visual, faces)
         material = visual.material
         image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
         uv = visual.uv
@@ -439,11 +466,13 @@ def _coloured(mesh: trimesh.Trimesh, vertices: np.ndarray, faces: np.ndarray) ->
             return Surface(
                 vertices,
                 faces,
-                np.ones((len(faces), 3, 3), np.float32),
+                np.ones((len(faces), 3, 3), np.float32) if tint is None else tint,
                 np.zeros(len(faces), int),
                 np.asarray(uv, np.float32)[faces],
                 (_texture(image, *_transparency(material)),),
             )
+        if tint is not None and "color" in visual.vertex_attributes:
+            return dataclasses.replace(Surface.plain(vertices, faces, colours), corner_colours=tint)
         colours[:] = np.asarray(material.main_color[:3]) / 255
     elif isinstance(visual, ColorVisuals) and visual.kind == "vertex":
         surface = Surface.plain(vertices, faces, colours)
@@ -452,6 +481,20 @@ def _coloured(mesh: trimesh.Trimesh, vertices: np.ndarray, faces: np.ndarray) ->
     elif isinstance(visual, ColorVisuals) and visual.kind == "face":
         colours = np.asarray(visual.face_colors)[:, :3] / 255
     return Surface.plain(vertices, faces, colours)
+
+
+def _tint(visual: TextureVisuals, faces: np.ndarray) -> np.ndarray | None:
+    """(F, 3, 3): by what glTF multiplies the picture, the material's factor and the colours of vertices."""
+    if not isinstance(visual.material, PBRMaterial):
+        return None
+    tint = np.ones((len(faces), 3, 3), np.float32)
+    if visual.material.baseColorFactor is not None:
+        tint *= np.asarray(visual.material.baseColorFactor[:3], np.float32) / 255
+    colours = visual.vertex_attributes.get("color")
+    if colours is not None:
+        top = np.iinfo(colours.dtype).max if colours.dtype.kind == "u" else 1
+        tint *= (np.asarray(colours, np.float32)[faces, :3] / top).clip(0, 1)
+    return tint
 
 
 def _transparency(material: object) -> tuple[str, float]:

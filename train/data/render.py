@@ -210,7 +210,7 @@ class Renderer:
         for number in np.unique(texture[texture >= 0]):
             chosen = np.flatnonzero(texture == number)
             uv = np.einsum("nk,nkc->nc", weights[chosen], surface.corner_uv[face[chosen]])
-            albedo[chosen] = _sample_texture(surface.textures[number], uv)
+            albedo[chosen] *= _sample_texture(surface.textures[number], uv)
         return albedo
 
 

@@ -14,8 +14,8 @@ class Surface:
     Attributes:
         vertices: (V, 3) float.
         faces: (F, 3) int.
-        corner_colours: (F, 3, 3) float32 in [0, 1]: RGB at the corners of each face.
-        face_texture: (F,) int, index into `textures`, or -1 for faces that have corner colours.
+        corner_colours: (F, 3, 3) float32 in [0, 1]: RGB at the corners of each face; a texture is multiplied by them.
+        face_texture: (F,) int, index into `textures`, or -1 for none.
         corner_uv: (F, 3, 2) float32, v up; read where `face_texture` >= 0.
         textures: images (h, w, 3) uint8.
         missing_files: names of files that the mesh's file names and that were not found.
