@@ -23,8 +23,7 @@ from diffpoint import losses, reference
 from models import PROFILES as SIZES
 from train.config import FitConfig, StageConfig
 from train.data.batches import LoadedSplit
-from train.device import CPU
-from train.distributed import connect
+from train.device import CPU, connect
 from train.methods import losses as train_losses
 from train.methods import recipe
 from train.training.trainer import Trainer

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from train.data.batches import load_split
-from train.distributed import World, connect
+from train.device import World, connect
 from train.methods import recipe
 from train.training.trainer import Trainer
 

@@ -125,8 +125,7 @@ import diffpoint  # noqa: E402
 from models import build_generator  # noqa: E402
 from train.config import FitConfig, with_steps  # noqa: E402
 from train.data.batches import LoadedSplit, load_split  # noqa: E402
-from train.device import CPU  # noqa: E402
-from train.distributed import World  # noqa: E402
+from train.device import CPU, World  # noqa: E402
 from train.errors import UserError  # noqa: E402
 from train.evaluation.evaluate import evaluate  # noqa: E402
 from train.evaluation.explore import explore  # noqa: E402

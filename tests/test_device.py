@@ -17,8 +17,7 @@ import torch
 
 from train.__main__ import main
 from train.config import renamed_options
-from train.device import CPU, moved, prepare, use_device
-from train.distributed import SINGLE, connect
+from train.device import CPU, SINGLE, connect, moved, prepare, use_device
 from train.errors import UserError
 from train.evaluation.runs import load_generator
 from train.methods import recipe

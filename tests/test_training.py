@@ -28,7 +28,7 @@ from train.data import tree_files
 from train.data.batches import LoadedSplit, load_split
 from train.data.render import Renderer, draw_camera
 from train.data.solids import bar, sample_union, surface_of
-from train.distributed import SINGLE, connect
+from train.device import SINGLE, connect
 from train.errors import UserError
 from train.evaluation.evaluate import evaluate
 from train.evaluation.runs import best_weights, latest_checkpoint, load_generator, read_metrics

@@ -79,7 +79,7 @@ class Fit:
     device: Device = "auto"
 
     def run(self) -> int:
-        from train.distributed import connect
+        from train.device import connect
         from train.training.trainer import fit
 
         config, device = self.config, _use_device(self.device)

@@ -23,7 +23,7 @@ from models import Generator
 from models.parts import IMAGE_GAIN, IMAGE_MEAN
 from train.config import FitConfig
 from train.data.batches import LoadedSplit
-from train.distributed import SINGLE, World
+from train.device import SINGLE, World
 from train.errors import UserError
 from train.evaluation.runs import read_split
 from train.evaluation.sensitivity import sensitivity

@@ -18,8 +18,7 @@ from diffpoint import check_pending
 from models import Autoencoder, Critic, Predictor
 from train.config import FitConfig, InferenceConfig, Recipe, StageConfig
 from train.data.batches import Targets
-from train.device import CPU
-from train.distributed import SINGLE, World
+from train.device import CPU, SINGLE, World
 from train.errors import UserError
 from train.methods.optimisers import adam
 from train.timer import Timer

@@ -21,8 +21,7 @@ from train.config import FitConfig, PretrainConfig, StageConfig, fit_config_from
 from train.data.augment import augment
 from train.data.batches import Batch, LoadedSplit, Sampler
 from train.data.layouts import require_depth
-from train.device import CPU, describe, moved
-from train.distributed import SINGLE, World, connect
+from train.device import CPU, SINGLE, World, connect, describe, moved
 from train.errors import UserError
 from train.evaluation.runs import (
     best_weights,

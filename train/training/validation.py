@@ -6,7 +6,7 @@ import torch
 
 from models import Autoencoder, Predictor
 from train.data.batches import LoadedSplit
-from train.distributed import SINGLE, World
+from train.device import SINGLE, World
 from train.evaluation.metrics import cloud_errors, in_silhouette, thin_out, visible_error
 
 METRICS = ("val_cd_1", "val_cd", "val_fps_cd", "val_visible", "val_inside")
