@@ -183,7 +183,10 @@ def test_the_command_writes_a_page_that_starts_where_the_images_agree(
 def test_reconstruct_writes_the_page_of_its_reconstruction(smoke_run: Path, picture: Path, tmp_path: Path):
     files = [str(picture), str(picture.with_name("render_1.png"))]
     assert main(["reconstruct", str(smoke_run), *files, "--out", str(tmp_path), "--steps", "1"]) == 0
-    found = reconstruct(load_generator(smoke_run), read_images([Path(file) for file in files]), steps=1)
+    run = open_run(smoke_run)
+    found = reconstruct(
+        run.model, read_images([Path(file) for file in files]), steps=1, settings=run.config.inference
+    )
     for packed, cloud in zip(
         _planes_in(tmp_path / "explore.html"), found.points[0].unflatten(0, (2, -1)), strict=True
     ):
