@@ -28,8 +28,8 @@ from train.show import figures, pages
 from train.show.report import shipped_weights_section
 from train.training.trainer import fit
 
-# A seventh of the profile's steps: about six minutes on two cores, and enough for more views to lower the error.
-DEMO_CONFIG = scaled(recipe("ours", "cpu", "whole-shapes"), 0.14)
+# An eighth of the profile's steps: about six minutes on two cores, and enough for more views to lower the error.
+DEMO_CONFIG = scaled(recipe("ours", "cpu", "whole-shapes"), 0.12)
 _RENDER_SIZE = 112
 _CATEGORIES = ("chair", "display")  # learnt in so short a training
 
