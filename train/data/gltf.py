@@ -8,6 +8,7 @@ not know, also those that say where the geometry is.
 from __future__ import annotations
 
 import base64
+import importlib.util
 import json
 import struct
 from collections.abc import Callable
@@ -32,24 +33,21 @@ _SPECULAR = "KHR_materials_pbrSpecularGlossiness"
 _TRANSFORM = "KHR_texture_transform"
 
 
-def described(content: bytes) -> dict[str, Any]:
-    """The JSON of a GLB or glTF file.
-
-    Raises:
-        ValueError: the file is broken.
-    """
-    return _split(content)[0]
-
-
 def plain(content: bytes, file_content: Callable[[str], bytes]) -> bytes:
     """The same meshes and materials as a GLB file with one buffer; pictures in files of their own stay there.
 
     Raises:
-        ValueError: the file is broken, or its geometry is in an extension that is not read.
+        ValueError: the file is broken, its geometry is in an extension that is not read, or compressed with Draco while
+            the package DracoPy is missing.
         FileNotFoundError: a file with its data is missing.
     """
     scene, binary = _split(content)
-    for extension in scene.get("extensionsRequired", ()):
+    required = scene.get("extensionsRequired", ())
+    if _DRACO in required and importlib.util.find_spec("DracoPy") is None:
+        raise ValueError(
+            "its geometry is compressed with Draco: pip install DracoPy, or save it uncompressed"
+        )
+    for extension in required:
         if not extension.startswith(_HARMLESS):
             raise ValueError(f"it needs the glTF extension {extension}, which is not read: save it without")
     document = _Document(scene, binary, file_content)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import re
 from collections.abc import Callable, Sequence
@@ -24,7 +23,6 @@ _POLYGON = re.compile(rb"^f((?: +\d+(?:/\d*){0,2}){4,}) *$", re.MULTILINE)
 """A face of an OBJ file with more than three corners."""
 
 _VERTEX = re.compile(rb"^v +(\S+) +(\S+) +(\S+)", re.MULTILINE)
-_DRACO = "KHR_draco_mesh_compression"
 
 
 def read_obj(content: bytes, files: Any) -> trimesh.Scene:
@@ -178,11 +176,6 @@ def _colours(words: list[list[str]]) -> np.ndarray:
 
 def read_gltf(content: bytes, files: Any) -> trimesh.Scene:
     """Reads a GLB or glTF file; one compressed with Draco needs the package DracoPy."""
-    required = gltf.described(content).get("extensionsRequired", ())
-    if _DRACO in required and importlib.util.find_spec("DracoPy") is None:
-        raise ValueError(
-            "its geometry is compressed with Draco: pip install DracoPy, or save it uncompressed"
-        )
     return _load(gltf.plain(content, files.get), "glb", files)
 
 
