@@ -7,6 +7,8 @@ COARSEST = 0.1  # first epsilon, relative to the largest cost that the extent of
 FIRST = 1.0
 # A first phase of more bids than this per point of the larger set has too small an epsilon, which is raised.
 LONG_PHASE = 20
+# Threads that help with one pair on the CPU, at most.
+HELPERS = 7
 # What distances and prices are taken for, relative to the largest cost of the pair, if they are less.
 LEAST_REACH = 1e-2
 # The smallest epsilon, relative to the accepted gap: a phase leaves a mean gap of 0.4 to 0.6 epsilon.

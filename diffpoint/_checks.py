@@ -223,7 +223,7 @@ def check_transport(
 
 
 def expected_extent(squared: bool) -> str:
-    """What `earth_mover_distance` expects of the extent of its first argument."""
+    """What a distance that matches points expects of the extent of its first argument."""
     if squared:
         return "span less than 1e9 together with 'b' for squared distances"
     return "span less than 1e18 together with 'b'"

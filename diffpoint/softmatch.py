@@ -104,7 +104,7 @@ def _approxmatch(
     )
     if not bool(torch.isfinite(cost).all()):
         raise _checks.fail(
-            "approxmatch", "a", "span less than 1e18 together with 'b'", "more", "Scale both down."
+            "approxmatch", "a", _checks.expected_extent(squared=False), "more", "Scale both down."
         )
     unit_a = grad_a.view(3, count, -1)[..., :n].movedim(0, -1).contiguous()
     unit_b = grad_b.view(3, count, -1)[..., :m].movedim(0, -1).contiguous()

@@ -14,9 +14,8 @@ from diffpoint.distances import paired_sets
 from diffpoint.sampling import lanes
 
 _ROUND = 32  # persons for whom all objects are scanned at the same prices; at most 64
-# Up to so many pairs of at least so many products of sizes are each shared out among so many more threads. Which there
-# are changes only the time.
-_HELPERS = 7  # as in kernels/transport.py
+# Pairs whose sizes have at least this product are each shared out among HELPERS more threads, if there are no more
+# pairs than that. Which threads there are changes only the time.
 _SHARED = 2**20
 
 
@@ -172,7 +171,7 @@ def _transport(
     tolerance: float,
     squared: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    extent = _checks.check_transport(a, b, a_lengths, b_lengths, prices, known_cost, squared)
+    largest_cost = _checks.check_transport(a, b, a_lengths, b_lengths, prices, known_cost, squared)
     count, n, m = a.shape[0], a.shape[1], b.shape[1]
     bound = torch.zeros(count, dtype=torch.float64)
     finished = torch.ones(count, dtype=torch.uint8)
@@ -199,7 +198,7 @@ def _transport(
     prices = prices - prices.amin(1, keepdim=True)
     price_lanes = pad(prices, (0, axes[0][0].numel() - size)).view(axes[0].shape)
     object_of, person_of, queue = (torch.empty((count, size), dtype=torch.int32) for _ in range(3))
-    helpers = _HELPERS if count <= _HELPERS and n * m >= _SHARED else 0
+    helpers = _auction.HELPERS if count <= _auction.HELPERS and n * m >= _SHARED else 0
     lists = size + helpers * _ROUND
     # Of every person the objects that it may bid for next without a look at all others.
     offers = torch.zeros((count, lists, LANES), dtype=torch.int32), a.new_zeros((count, lists, LANES))
@@ -214,7 +213,7 @@ def _transport(
         price_lanes.view(count, -1),
         person_counts,
         object_counts,
-        extent,
+        largest_cost,
         known_cost,
         enough,
         object_of,

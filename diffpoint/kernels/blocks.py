@@ -140,8 +140,8 @@ def box_tests(real):
         return total
 
     @ti.func
-    def reached(boxes: ti.template(), cloud, row, low: ti.template(), high: ti.template(), farthest):
-        """Bit s: box s of a row of 16 is within the squared distance `farthest` of the box from `low` to `high`."""
+    def gaps(boxes: ti.template(), cloud, row, low: ti.template(), high: ti.template()):
+        """Squared distances of a row of 16 boxes from the box from `low` to `high`."""
         total = ti.Vector([real(0.0) for s in ti.static(range(LANES))])
         for k in ti.static(range(3)):
             below = boxes[cloud, k, row] - high[k]
@@ -150,6 +150,12 @@ def box_tests(real):
                 outside = ti.select(below[s] > above[s], below[s], above[s])
                 outside = ti.select(outside > 0, outside, real(0.0))
                 total[s] += outside * outside
+        return total
+
+    @ti.func
+    def reached(boxes: ti.template(), cloud, row, low: ti.template(), high: ti.template(), farthest):
+        """Bit s: box s of a row of 16 is within the squared distance `farthest` of the box from `low` to `high`."""
+        total = gaps(boxes, cloud, row, low, high)
         bits = 0
         for s in ti.static(range(LANES)):
             bits |= ti.select(total[s] <= farthest, 1 << s, 0)
@@ -170,4 +176,4 @@ def box_tests(real):
             least = ti.select(closer, d, least)
         return best
 
-    return SimpleNamespace(clamped=clamped, gap=gap, reached=reached, most_central=most_central)
+    return SimpleNamespace(clamped=clamped, gap=gap, gaps=gaps, reached=reached, most_central=most_central)

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from diffpoint.kernels._backend import ti
-from diffpoint.kernels.blocks import BLOCK, LANES, ROWS
+from diffpoint.kernels.blocks import BLOCK, LANES, ROWS, box_tests
 
 PARTS = BLOCK // LANES  # vectors in a box
 
@@ -67,20 +67,14 @@ def build(real):
                         best = ti.select(better, d, best)
 
     boxes3 = ti.types.ndarray(dtype=ti.types.vector(LANES, real), ndim=3)
+    gaps = box_tests(real).gaps
     orders2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
     @ti.func
     def reached(boxes: ti.template(), farthest: ti.template(), cloud, t, x, y, z):
         """Bit s: box s of a row of 16 is no farther from (x, y, z) than the largest distance in it."""
         here = ti.Vector([x, y, z])
-        gap = ti.Vector([real(0.0) for s in ti.static(range(LANES))])
-        for axis in ti.static(range(3)):
-            below = boxes[cloud, axis, t] - here[axis]
-            above = here[axis] - boxes[cloud, axis + 3, t]
-            for s in ti.static(range(LANES)):
-                outside = ti.select(below[s] > above[s], below[s], above[s])
-                outside = ti.select(outside > 0, outside, real(0.0))
-                gap[s] += outside * outside
+        gap = gaps(boxes, cloud, t, here, here)
         bits = 0
         for s in ti.static(range(LANES)):
             bits |= ti.select(gap[s] <= farthest[s], 1 << s, 0)

@@ -20,6 +20,7 @@ from diffpoint._auction import (
     ENOUGH,
     FAR,
     FIRST,
+    HELPERS,
     LEAST_REACH,
     LEAST_SCALING,
     LONG_PHASE,
@@ -27,12 +28,11 @@ from diffpoint._auction import (
     SCALING,
 )
 from diffpoint.kernels._backend import ti
+from diffpoint.kernels.blocks import LANES
 
-LANES = 16
 STOP, BID, MEASURE, MEASURE_START = 0, 1, 2, 3  # what the auction of a pair does next
 # Columns of `shared`, each on a line of the cache of its own.
 LEFT, ROUND, OVER = 0, 16, 32
-HELPERS = 7  # threads that help at most
 # How often the thread of a pair looks for the scan of a helper before it scans itself, for every 16 objects.
 PATIENCE = 8
 MOST_IDLE = 200_000  # how often a helper looks for work in vain
