@@ -330,7 +330,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     try:
         try:
-            return _run(renamed_options(sys.argv[1:] if arguments is None else arguments))
+            command = _parse(renamed_options(sys.argv[1:] if arguments is None else arguments))
+            return command.run() or 0
         finally:
             sys.stdout.flush()
     except BrokenPipeError:  # who reads our output, such as `head`, has seen enough
@@ -346,10 +347,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
-
-
-def _run(arguments: list[str]) -> int:
-    return _parse(arguments).run() or 0
 
 
 def _drop_output() -> None:
