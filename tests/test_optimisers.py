@@ -43,6 +43,27 @@ def test_singular_values_of_a_step_are_about_one() -> None:
         assert values.min() > 0.6 and values.max() < 1.3
 
 
+def test_large_matrices_are_made_orthogonal_in_blocks_of_256_rows() -> None:
+    """Of the shorter side, and together with other matrices of as many rows."""
+    torch.manual_seed(3)
+    layers = [nn.Linear(columns, rows) for rows, columns in ((300, 400), (400, 300), (256, 500))]
+    before = [layer.weight.detach().clone() for layer in layers]
+    for layer in layers:
+        rows, columns = layer.weight.shape
+        layer.weight.grad = torch.randn(rows, 30) @ torch.randn(30, columns) + torch.randn(rows, columns)
+        layer.weight.grad[:5] = 0.0  # dead units
+    optimiser = Muon(nn.ModuleList(layers), output_layers=[])
+    set_learning_rate(optimiser, 0.01)
+    optimiser.step()
+    for layer, start, sizes in zip(layers, before, ([256, 44], [256, 44], [256]), strict=True):
+        change = (start - layer.weight.detach()) / (0.01 * 0.2)
+        assert (change[:5] == 0).all()
+        wide = change if len(change) <= change.shape[1] else change.T
+        for block in wide.split(sizes):
+            values = torch.linalg.svdvals(block[block.abs().amax(1) > 0]) / wide.shape[1] ** 0.5
+            assert values.min() > 0.6 and values.max() < 1.3
+
+
 def test_vectors_and_output_layers_are_adams() -> None:
     network, other = _with_gradients(_network()), _with_gradients(_network())
     optimiser = Muon(network, output_layers=[network[4]], weight_decay=0.1)
