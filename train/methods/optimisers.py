@@ -20,7 +20,7 @@ class Muon(torch.optim.Optimizer):
     The step of a matrix is its momentum made orthogonal, so that directions with small gradients are learnt as fast as
     those with large ones. It is scaled to the size of a typical step of Adam, so that both take the same learning rate.
     A convolution's kernel is a matrix with one row per output channel. The layers in `output_layers`, whose rows are
-    coordinates and not features, and all vectors are left to Adam. Of matrices with more than 256 rows, blocks of 256
+    coordinates and not features, and all vectors are left to Adam. Of matrices with more than 128 rows, blocks of 128
     rows are made orthogonal each for itself.
 
     Args:
@@ -112,9 +112,11 @@ def set_learning_rate(optimiser: torch.optim.Optimizer, learning_rate: float) ->
 # A polynomial that moves singular values from (0, 1] to about one when it is applied several times.
 _POLYNOMIAL = 3.4445, -4.7750, 2.0315
 _TIMES = 5
-_ROWS = 256
-"""Matrices with more rows are made orthogonal in blocks of so many. A step of the shipped network's matrices takes
-0.09 s on two cores, with whole matrices 0.32."""
+_ROWS = 128
+"""Matrices with more rows are made orthogonal in blocks of so many. On two cores that takes 0.06 s a step for a decoder
+of twice the width, for whole matrices 0.32. The network learns as fast: after 600 steps on the embedded shapes (one
+seed, 146 validation shapes) CD with 1 and 8 views is 6.94 and 5.33, with blocks of 256 rows 7.06 and 5.41, with whole
+matrices 6.99 and 5.33."""
 # Where a unit is dead, its momentum decays to denormal numbers, with which processors are several times slower: a step
 # of the shipped network took 1.0 s at first, and after 1700 steps 2.3. Products of several factors must not get there.
 _NOTHING = 1e-30
