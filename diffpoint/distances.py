@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffpoint import _bridge, _checks
+from diffpoint import _bridge, _checks, _parts
 from diffpoint._common import share_within
 from diffpoint.blocks import Blocks, sort_into_blocks
 
@@ -319,6 +319,12 @@ def _nearest_both(
 def _nearest_both_backward(
     a: Tensor, b: Tensor, from_a: Tensor, from_b: Tensor, grad_from_a: Tensor, grad_from_b: Tensor
 ) -> tuple[Tensor, Tensor]:
+    if len(a) and _parts.summed_parts(a.shape[1] + b.shape[1]) > 1:
+        grad_a, grad_b, sum_a, sum_b = (torch.empty_like(x) for x in (a, b, a, b))
+        inputs = a, b, from_a, from_b, grad_from_a, grad_from_b
+        arrays = (x.view(-1) for x in (*inputs, grad_a, grad_b, sum_a, sum_b))
+        _bridge.launch("nearest", "backward_both", a.dtype, *arrays, a.shape[1], b.shape[1])
+        return grad_a, grad_b
     grad_a, grad_b = a.new_zeros(a.shape), b.new_zeros(b.shape)
     add_nearest_gradients(a, b, from_a, grad_from_a, grad_a, grad_b)
     add_nearest_gradients(b, a, from_b, grad_from_b, grad_b, grad_a)

@@ -178,6 +178,29 @@ def test_chamfer_of_large_clouds_is_that_of_small_ones(monkeypatch):
     assert all(torch.equal(x, y) for x, y in zip(*results, strict=True))
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (70, 30), (30, 70)])
+def test_gradients_of_large_pairs_are_those_of_small_ones(monkeypatch, dtype, n, m):
+    """Where each direction has sums of its own: with one target of many points, and padding on either side."""
+    generator = torch.Generator().manual_seed(n)
+    a, b = (torch.rand(3, k, 3, dtype=dtype, generator=generator) for k in (n, m))
+    b[1] *= 0.01
+    a_lengths, b_lengths = (torch.tensor([k, max(1, k - 7), max(1, k // 2)]) for k in (n, m))
+    for points, lengths in ((a, a_lengths), (b, b_lengths)):
+        points[torch.arange(points.shape[1]) >= lengths[:, None]] = torch.nan
+    weights = torch.rand(2, 3, dtype=dtype, generator=generator)
+
+    def gradients():
+        leaves = [x.clone().requires_grad_() for x in (a, b)]
+        distance = dp.chamfer_distance(*leaves, squared=True, a_lengths=a_lengths, b_lengths=b_lengths)
+        return torch.autograd.grad(list(distance), leaves, list(weights))
+
+    expected = gradients()
+    monkeypatch.setattr("diffpoint._parts._SUMMED", 1)
+    for gradient, other in zip(gradients(), expected, strict=True):
+        torch.testing.assert_close(gradient, other, rtol=1e-5, atol=1e-6 if dtype == torch.float32 else 1e-14)
+
+
 def test_chamfer_of_a_shifted_lattice_is_the_shift():
     lattice = torch.cartesian_prod(*(torch.arange(5.0),) * 3)
     shift = torch.tensor([0.1, 0.0, 0.0])

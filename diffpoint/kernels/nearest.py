@@ -227,7 +227,7 @@ def build(real):
         One thread per cloud adds to the gradients in a fixed order, without atomics; in flat arrays, whose offsets take
         half the time, and with the sums of a point of `a` in registers. Shares of a cloud, each with a range of the
         targets and all indices, take as long on two threads as the whole does on one: every other index is then a
-        branch that is predicted wrongly.
+        branch that is predicted wrongly. Of both directions of a large pair, see `backward_both`.
         """
         for step in range(a.shape[0] // (3 * n) * spread):
             if step % spread == 0:
@@ -249,4 +249,73 @@ def build(real):
                     for k in ti.static(range(3)):
                         grad_a[3 * i + k] = total[k]
 
-    return SimpleNamespace(forward=forward, forward_blocks=forward_blocks, backward=backward)
+    @ti.func
+    def of_one_direction(
+        a: ti.template(),
+        b: ti.template(),
+        index: ti.template(),
+        grad_squared_distance: ti.template(),
+        grad_a: ti.template(),
+        grad_b: ti.template(),
+        n,
+        m,
+        cloud,
+    ):
+        """Writes the gradients of the distances from a cloud of `a` to its nearest neighbours."""
+        for place in range(3 * cloud * m, 3 * (cloud + 1) * m):
+            grad_b[place] = real(0.0)
+        for i in range(cloud * n, cloud * n + n):
+            component = ti.Vector([real(0.0)] * 3)
+            j = ti.cast(index[i], ti.i32)
+            if j >= 0:
+                at = 3 * (cloud * m + j)
+                g = real(2.0) * grad_squared_distance[i]
+                before = ti.Vector([grad_b[at + k] for k in ti.static(range(3))])
+                component = g * ti.Vector([a[3 * i + k] - b[at + k] for k in ti.static(range(3))])
+                for k in ti.static(range(3)):
+                    grad_b[at + k] = before[k] - component[k]  # not -=, which would be atomic
+            for k in ti.static(range(3)):
+                grad_a[3 * i + k] = component[k]
+
+    @ti.kernel
+    def backward_both(
+        a: reals,
+        b: reals,
+        from_a: integers,
+        from_b: integers,
+        grad_from_a: reals,
+        grad_from_b: reals,
+        grad_a: reals,
+        grad_b: reals,
+        sum_a: reals,
+        sum_b: reals,
+        n: ti.i32,
+        m: ti.i32,
+        spread: ti.i32,
+    ):
+        """`backward` of both directions, one thread for each, with sums of its own: a lone pair takes two threads.
+
+        `sum_a` and `sum_b` are room for what one direction adds to the targets of the other. On small clouds this takes
+        half as long again as two calls of `backward` on one thread, and no less time on two.
+        """
+        directions = 2 * (a.shape[0] // (3 * n))
+        for step in range(directions * spread):
+            if step % spread == 0:
+                cloud = step // spread // 2
+                if step // spread % 2 == 0:
+                    of_one_direction(a, b, from_a, grad_from_a, grad_a, sum_b, n, m, cloud)
+                else:
+                    of_one_direction(b, a, from_b, grad_from_b, grad_b, sum_a, m, n, cloud)
+        for step in range(directions * spread):
+            if step % spread == 0:
+                cloud = step // spread // 2
+                if step // spread % 2 == 0:
+                    for place in range(3 * cloud * n, 3 * (cloud + 1) * n):
+                        grad_a[place] = grad_a[place] + sum_a[place]
+                else:
+                    for place in range(3 * cloud * m, 3 * (cloud + 1) * m):
+                        grad_b[place] = grad_b[place] + sum_b[place]
+
+    return SimpleNamespace(
+        forward=forward, forward_blocks=forward_blocks, backward=backward, backward_both=backward_both
+    )
