@@ -28,8 +28,8 @@ from train.show import figures, pages
 from train.show.report import shipped_weights_section
 from train.training.trainer import fit
 
-# An eighth of the profile's steps: about six minutes on two cores, and enough for more views to lower the error.
-DEMO_CONFIG = scaled(recipe("ours", "cpu", "whole-shapes"), 0.12)
+# A sixth of the profile's steps: four to six minutes on two cores, and enough for more views to lower the error.
+DEMO_CONFIG = scaled(recipe("ours", "cpu", "whole-shapes"), 0.16)
 _RENDER_SIZE = 112
 _CATEGORIES = ("chair", "display")  # learnt in so short a training
 
