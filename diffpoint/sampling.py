@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -125,15 +123,24 @@ def _farthest(
 
 
 def _in_range(points: Tensor, lengths: Tensor) -> Tensor:
-    """The points; times a power of two, which chooses the same ones, where squared distances overflow or vanish."""
-    largest = max(abs(float(extreme)) for extreme in torch.aminmax(points))
-    if not 1e-12 < largest < 1e18:
-        padding = torch.arange(points.shape[1]) >= lengths[:, None]
-        points = points.masked_fill(padding[..., None], 0)
-        largest = float(points.abs().max())
-        if largest > 0 and not 1e-12 < largest < 1e18:
-            points = torch.ldexp(points.double(), torch.tensor(-math.frexp(largest)[1])).to(points.dtype)
-    return points
+    """The points; a cloud whose squared distances overflow or vanish times a power of two, which chooses the same."""
+    if bool(_ordinary(_largest(points)).all()):
+        return points
+    padding = torch.arange(points.shape[1]) >= lengths[:, None]
+    points = points.masked_fill(padding[..., None], 0)
+    largest = _largest(points).double()
+    exponent = torch.frexp(largest).exponent.masked_fill(_ordinary(largest), 0).to(torch.int64)
+    half = ((1023 - exponent // 2) << 52).view(torch.float64)[:, None, None]  # 2^(-exponent / 2), by its bits
+    return (points.double() * half * half).to(points.dtype)
+
+
+def _largest(points: Tensor) -> Tensor:
+    """(B,): the largest magnitude of a coordinate."""
+    return points.flatten(1).abs().amax(1)
+
+
+def _ordinary(largest: Tensor) -> Tensor:
+    return (largest > 1e-12) & (largest < 1e18)
 
 
 def _unset_distance(points: Tensor, lengths: Tensor, size: int) -> Tensor:

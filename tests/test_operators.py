@@ -304,10 +304,16 @@ def test_tensors_without_values() -> None:
 @pytest.mark.parametrize("size", [40, 5000])
 @pytest.mark.parametrize("scale", [2.0**-80, 2.0**66])
 def test_farthest_points_where_squares_leave_the_range(size: int, scale: float) -> None:
+    """Of a batch of such clouds, and of one beside an ordinary cloud."""
     points = torch.rand(2, size, 3, generator=torch.Generator().manual_seed(0)) + 1
     lengths = torch.tensor([size, 20])
     expected = dp.farthest_point_sample(points, 9, lengths=lengths)
-    assert torch.equal(dp.farthest_point_sample(points * scale, 9, lengths=lengths), expected)
+    for scales in (scale, torch.tensor([[[scale]], [[1.0]]])):
+        assert torch.equal(dp.farthest_point_sample(points * scales, 9, lengths=lengths), expected)
+    fine = points.double()
+    wide = fine * 2.0 ** (600 if scale > 1 else -600)
+    both = (dp.farthest_point_sample(x, 9, lengths=lengths) for x in (fine, wide))
+    assert torch.equal(*both)
     if scale > 1:
         with pytest.raises(ValueError, match="approxmatch: 'a' must span less than 1e18"):
             dp.approxmatch(points[:, :9] * scale, points[:, :9].flip(1) * scale)

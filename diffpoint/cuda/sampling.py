@@ -32,6 +32,22 @@ def _limits(lengths, counts, starts, too_many, cloud, size, allow_fewer):
 
 
 @triton.jit
+def _shrink(largest):
+    """A power of two; coordinates of which `largest` is the largest magnitude are to be multiplied by it twice.
+
+    It is 1 unless their squared distances may overflow or vanish; the product is then near 1. A scaled cloud has the
+    same farthest points.
+    """
+    if largest.dtype == tl.float32:
+        exponent = ((largest.to(tl.int32, bitcast=True) >> 23) & 255) - 127
+        half = ((127 - exponent // 2) << 23).to(tl.float32, bitcast=True)
+    else:
+        exponent = ((largest.to(tl.int64, bitcast=True) >> 52) & 2047) - 1023
+        half = ((1023 - exponent // 2) << 52).to(tl.float64, bitcast=True)
+    return tl.where((largest > 1e-12) & (largest < 1e18), 1.0, half).to(largest.dtype)
+
+
+@triton.jit
 def _farthest(
     points,
     lengths,
@@ -52,12 +68,16 @@ def _farthest(
     x = tl.load(points + i * 3, mask=inside, other=0.0)
     y = tl.load(points + i * 3 + 1, mask=inside, other=0.0)
     z = tl.load(points + i * 3 + 2, mask=inside, other=0.0)
+    half = _shrink(tl.max(tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z)), axis=0))
+    x = x * half * half
+    y = y * half * half
+    z = z * half * half
     distance = tl.where(inside, float("inf"), -1.0).to(x.dtype)
     for pick in range(tl.minimum(count, width)):
         tl.store(chosen + cloud * width + pick, current.to(tl.int64))
-        dx = x - tl.load(points + current * 3)
-        dy = y - tl.load(points + current * 3 + 1)
-        dz = z - tl.load(points + current * 3 + 2)
+        dx = x - tl.load(points + current * 3) * half * half
+        dy = y - tl.load(points + current * 3 + 1) * half * half
+        dz = z - tl.load(points + current * 3 + 2) * half * half
         distance = tl.minimum(distance, dx * dx + dy * dy + dz * dz)
         distance = tl.where(i == current, -1.0, distance)  # not chosen twice
         current = tl.argmax(distance, axis=0)  # of equal distances the first
@@ -74,19 +94,24 @@ def _farthest_of_many(
     points += cloud * size * 3
     distance += cloud * size
     dtype: tl.constexpr = points.dtype.element_ty
+    largest = tl.zeros((TILE,), dtype)
+    for first in range(0, length * 3, TILE):
+        i = first + tl.arange(0, TILE)
+        largest = tl.maximum(largest, tl.abs(tl.load(points + i, mask=i < length * 3, other=0.0)))
+    half = _shrink(tl.max(largest, axis=0))
     for pick in range(tl.minimum(count, width)):
         tl.store(chosen + cloud * width + pick, current.to(tl.int64))
-        px = tl.load(points + current * 3)
-        py = tl.load(points + current * 3 + 1)
-        pz = tl.load(points + current * 3 + 2)
+        px = tl.load(points + current * 3) * half * half
+        py = tl.load(points + current * 3 + 1) * half * half
+        pz = tl.load(points + current * 3 + 2) * half * half
         best = tl.full((TILE,), -1.0, dtype)
         tile = tl.zeros((TILE,), tl.int32)
         for first in range(0, length, TILE):
             i = first + tl.arange(0, TILE)
             inside = i < length
-            dx = tl.load(points + i * 3, mask=inside, other=0.0) - px
-            dy = tl.load(points + i * 3 + 1, mask=inside, other=0.0) - py
-            dz = tl.load(points + i * 3 + 2, mask=inside, other=0.0) - pz
+            dx = tl.load(points + i * 3, mask=inside, other=0.0) * half * half - px
+            dy = tl.load(points + i * 3 + 1, mask=inside, other=0.0) * half * half - py
+            dz = tl.load(points + i * 3 + 2, mask=inside, other=0.0) * half * half - pz
             before = tl.load(distance + i, mask=inside & (pick > 0), other=float("inf"))
             least = tl.minimum(before, dx * dx + dy * dy + dz * dz)
             least = tl.where(i == current, -1.0, least)  # not chosen twice
