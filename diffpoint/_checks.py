@@ -222,6 +222,12 @@ def check_transport(
     return largest.clamp(min=_auction.SMALLEST_COST).to(a.dtype)
 
 
+def check_cost(function: str, cost: Tensor) -> None:
+    """Costs of matching `a` with `b`, which are finite unless the sets span too much."""
+    if not bool(torch.isfinite(cost).all()):
+        raise fail(function, "a", expected_extent(squared=False), "more", "Scale both down.")
+
+
 def expected_extent(squared: bool) -> str:
     """What a distance that matches points expects of the extent of its first argument."""
     if squared:

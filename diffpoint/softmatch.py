@@ -102,10 +102,7 @@ def _approxmatch(
         grad_b,
         int(with_gradient),
     )
-    if not bool(torch.isfinite(cost).all()):
-        raise _checks.fail(
-            "approxmatch", "a", _checks.expected_extent(squared=False), "more", "Scale both down."
-        )
+    _checks.check_cost("approxmatch", cost)
     unit_a = grad_a.view(3, count, -1)[..., :n].movedim(0, -1).contiguous()
     unit_b = grad_b.view(3, count, -1)[..., :m].movedim(0, -1).contiguous()
     return cost.to(a.dtype), unit_a, unit_b

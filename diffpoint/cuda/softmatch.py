@@ -138,8 +138,15 @@ def approxmatch(
             if with_gradient:
                 masses = request, offer, unused, unused, grad_b
                 launch(_move, programs_b, *from_b, *masses, *sizes_b, level, False, True, *tile)
-    errors.settle(a, lambda: _checks.check_sets("approxmatch", a, b, a_lengths, b_lengths, smallest=1))
-    return cost.sum(1).to(a.dtype), grad_a, grad_b
+    total = cost.sum(1)
+    errors.counter(a, "approxmatch", "a", "extent").add_((~torch.isfinite(total)).sum())
+
+    def name_it() -> None:
+        _checks.check_sets("approxmatch", a, b, a_lengths, b_lengths, smallest=1)
+        _checks.check_cost("approxmatch", total)
+
+    errors.settle(a, name_it)
+    return total.to(a.dtype), grad_a, grad_b
 
 
 def _masses(points: Tensor, lengths: Tensor, other_lengths: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ def count_not_finite(x, y, z, counter):
 
 @triton.jit
 def _count_bad(points, lengths, not_finite, not_in_range, size, smallest, BLOCK: tl.constexpr):
-    blocks = tl.cdiv(size * 3, BLOCK)
+    blocks = tl.maximum(tl.cdiv(size * 3, BLOCK), 1)
     row = (tl.program_id(0) // blocks).to(tl.int64)
     block = tl.program_id(0) % blocks
     length = tl.load(lengths + row)
