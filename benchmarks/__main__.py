@@ -1,8 +1,9 @@
 """`python -m benchmarks`: times of every op and its peers, run in turns, medians; writes benchmarks/results/.
 
 Parts: races (with each op's extra memory), memory (its growth), dispatch (of torch operators), sweep (over the number
-of points), lone (large clouds on one thread and on all), train (a training step). `publish` puts the tables of the last
-run into README.md and docs/performance.md. `gpu` measures a GPU instead, within --minutes, and tests the kernels on it.
+of points), lone (large clouds on one thread and on all), train (a training step), gpu (ops and training steps on a GPU
+within --minutes, and tests of the kernels there; files of its own; skipped where there is no GPU). `publish` puts the
+tables of the last run into README.md and docs/performance.md.
 """
 
 from __future__ import annotations
@@ -33,21 +34,24 @@ def main() -> int:
         "--out", type=Path, default=Path(__file__).parent / "results", help="where results go"
     )
     arguments = parser.parse_args()
-    parts: list[str] = arguments.parts or (["races"] if arguments.only else list(PARTS))
+    every = [*PARTS] if arguments.quick else [*PARTS, "gpu"]
+    parts: list[str] = arguments.parts or (["races"] if arguments.only else every)
     if unknown := set(parts) - {*PARTS, "publish", "gpu"}:
         names = ", ".join(PARTS)
-        parser.error(f"no such part: {', '.join(sorted(unknown))} (parts: {names}; or publish, or gpu)")
+        parser.error(f"no such part: {', '.join(sorted(unknown))} (parts: {names}, gpu; or publish)")
     warnings.filterwarnings("ignore", category=UserWarning, module="numba")
 
     if parts == ["publish"]:
         from benchmarks.publish import publish
 
         return publish(arguments.out)
-    if parts == ["gpu"]:
+    status = 0
+    if "gpu" in parts:
         from benchmarks import gpu
 
-        return gpu.main(arguments.out, minutes=arguments.minutes)
-    return _measure(parts, arguments)
+        status = gpu.main(arguments.out, minutes=arguments.minutes)
+        parts = [part for part in parts if part != "gpu"]
+    return max(status, _measure(parts, arguments)) if parts else status
 
 
 def _measure(parts: list[str], arguments: argparse.Namespace) -> int:

@@ -6,6 +6,7 @@ named and left out. It writes `gpu-<name>.json` and `.md` after each part, so th
 
 from __future__ import annotations
 
+import functools
 import json
 import statistics
 import subprocess
@@ -36,22 +37,36 @@ def main(out: Path, *, minutes: float) -> int:
         missing = "without CUDA" if torch.version.cuda is None else "and finds no GPU"
         print(f"gpu: skipped: {built if torch.version.cuda else f'torch {torch.__version__}'} {missing}")
         return 0
-    end = time.monotonic() + 60 * minutes
+    parts = {"ops": _ops, "steps": _steps, "tests": _tests, "training": _training}
     path = out / f"gpu-{saved.file_stem(torch.cuda.get_device_name())}.json"
-    results: dict[str, Any] = {"machine": _machine()}
+    return _measure(parts, _machine(), path, minutes=minutes)
+
+
+def _measure(
+    parts: dict[str, Callable[[float], Iterator[dict[str, Any]]]],
+    machine: dict[str, Any],
+    path: Path,
+    *,
+    minutes: float,
+) -> int:
+    """Runs parts, each until a time of its own, and saves after each; returns the exit status."""
+    end = time.monotonic() + 60 * minutes
+    results: dict[str, Any] = {"machine": machine}
     failed = False
-    for part, measure in (("ops", _ops), ("steps", _steps), ("tests", _tests), ("training", _training)):
+    for part, measure in parts.items():
         left = end - time.monotonic()
-        if left < 20:
-            results[part] = [{"left out": "no time left"}]
-            continue
-        print(f"--- {part}", flush=True)
         rows: list[dict[str, Any]] = []
+        if left < 20:
+            rows.append({"left out": "no time left"})
+        print(f"--- {part}" + (": no time left" if rows else ""), flush=True)
         stop = time.monotonic() + left * _SHARES[part]
         try:
-            for row in measure(stop):
+            for row in measure(stop) if not rows else ():
                 rows.append(row)
                 print("  " + ", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+        except ImportError as error:
+            rows.append({"left out": f"a package is missing: {error}"})
+            print(f"  {rows[-1]['left out']}", flush=True)
         except Exception as error:  # one part that fails must not lose the others
             failed = True
             rows.append({"failed": f"{type(error).__name__}: {error}"[:2000]})
@@ -59,13 +74,19 @@ def main(out: Path, *, minutes: float) -> int:
         results[part] = rows
         saved.save(results, _page(results), path)
     print(f"Saved {path}, and .md beside it")
-    return 1 if failed or any("failed" in row for rows in results.values() for row in rows) else 0
+    parted = (row for part in parts for row in results[part])
+    return 1 if failed or any("failed" in row for row in parted) else 0
 
 
 def _machine() -> dict[str, Any]:
     major, minor = torch.cuda.get_device_capability()
     triton = optional("triton")
-    return saved.machine() | {
+    try:
+        here = saved.machine()
+    except ImportError as error:  # without taichi there is nothing to compare with, but the GPU can be timed
+        print(error)
+        here = {"torch": torch.__version__}
+    return here | {
         "gpu": torch.cuda.get_device_name(),
         "capability": f"{major}.{minor}",
         "memory_gib": round(torch.cuda.get_device_properties(0).total_memory / 2**30, 1),
@@ -83,12 +104,13 @@ def _ops(stop: float, device: str = "cuda", clouds: int = 80, points: int = 2048
             yield {"left out": f"{op} and those after it: no time left"}
             return
         row: dict[str, Any] = {"op": op, "size": size, "mark_ms": mark}
-        for name, run in (("diffpoint", ours), *peers):
+        ways: list[Way] = [("diffpoint", ours), *peers]
+        timed = [(name, functools.partial(_milliseconds, run)) for name, run in ways]
+        for name, find in (*timed, ("differs", agreement)):
             try:
-                row[name] = round(_milliseconds(run), 4)
-            except Exception as error:  # a peer may lack a compiler, or memory
-                row[name] = f"{type(error).__name__}: {str(error).strip().splitlines()[0][:120]}"
-        row["differs"] = agreement()
+                row[name] = find()
+            except Exception as error:  # a peer may lack a compiler, or memory; the CPU's result needs taichi
+                row[name] = f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:120]}"
         yield row
 
 
@@ -105,7 +127,7 @@ def _milliseconds(run: Callable[[], Any]) -> float:
         times.append(1e3 * (time.perf_counter() - begin))
         if sum(times) > 3000:
             break
-    return statistics.median(times)
+    return round(statistics.median(times), 4)
 
 
 def _finish() -> None:
@@ -223,7 +245,7 @@ def _steps(stop: float) -> Iterator[dict[str, Any]]:
 
 def _tests(stop: float) -> Iterator[dict[str, Any]]:
     """The layer's tests, on CUDA tensors where they are about these."""
-    files = [f"tests/test_{name}.py" for name in ("cuda_kernels", "operators", "device")]
+    files = [f"tests/test_{name}.py" for name in ("cuda_kernels", "cuda_transport", "operators", "device")]
     command = [sys.executable, "-m", "pytest", *files, "-q"]
     command += ["-p", "no:cacheprovider", "-W", "ignore::DeprecationWarning"]
     yield _run("tests", command, stop)
