@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,7 +42,8 @@ def _chosen_kernels(request: pytest.FixtureRequest) -> Iterator[None]:
         return
     from diffpoint.testing import cuda_kernels_interpreted
 
-    with cuda_kernels_interpreted():
+    with cuda_kernels_interpreted(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=RuntimeWarning, module="triton")  # numpy's, of infinities
         yield
 
 

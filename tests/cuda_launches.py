@@ -19,6 +19,8 @@ from diffpoint.testing import assert_close, cuda_kernels_interpreted
 
 ON_GPU = torch.cuda.is_available()
 DEVICE = "cuda" if ON_GPU else "cpu"
+WARNINGS = ("ignore::RuntimeWarning", "error:divide by zero encountered in (fmod|floor):RuntimeWarning")
+"""The interpreter computes with numpy, which warns of infinities; an integer divided by zero is a mistake."""
 
 
 @contextlib.contextmanager

@@ -17,12 +17,11 @@ from diffpoint import _auction
 
 pytest.importorskip("triton", reason="triton has no wheel here")
 import triton.language as tl
-from cuda_launches import DEVICE, ON_GPU, compile_launches, on_cpu, recorded_launches
+from cuda_launches import DEVICE, ON_GPU, WARNINGS, compile_launches, on_cpu, recorded_launches
 
 from diffpoint.cuda import transport
 
-# The interpreter computes with numpy, which warns of infinities.
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+pytestmark = pytest.mark.filterwarnings(*WARNINGS)
 DTYPES = (torch.float32, torch.float64)
 ROUNDING = {torch.float32: 1e-6, torch.float64: 1e-12}
 LAUNCHES: dict[str, dict] = {}
