@@ -495,6 +495,16 @@ def test_photographs_are_reconstructed(study: Study, pictures: Path, monkeypatch
     assert f"--seeds {study.seeds} --pictures {pictures.name}`" in again
 
 
+def test_photographs_are_reconstructed_by_a_given_run(
+    pictures: Path, smoke_run: Path, tmp_path: Path
+) -> None:
+    study = Study((), tmp_path, "smoke", seeds=2, run=smoke_run, pictures=pictures, progress=False)
+    result = run_experiment("photos", study)
+    assert result["run"] == str(smoke_run) and len(result["objects"]["rendered"]["agreed"]["by_seed"]) == 2
+    assert f"the run {smoke_run}, codes drawn 2 times" in (tmp_path / "photos.md").read_text()
+    assert not (tmp_path / "runs").exists()
+
+
 def test_too_many_photographs_are_named(
     pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

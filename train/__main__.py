@@ -278,8 +278,8 @@ class Experiment:
     pictures: Path | None = None
     """photos: a folder with a folder of pictures for each object."""
     run_: Annotated[Path | None, arg(name="run")] = None
-    """agreement, coverage: the run it is about, a .safetensors file of one, or the word `pretrained`; networks are
-    trained if not given."""
+    """agreement, coverage, photos: the run it is about, a .safetensors file of one, or the word `pretrained`; networks
+    are trained if not given."""
     views: int = 8
     """agreement: views per shape."""
     device: Device = "auto"

@@ -6,8 +6,10 @@ descent.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +18,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from models import Predictor
 from train.config import FitConfig, changed_settings
 from train.data.cutout import cut_out
 from train.data.images import is_cut_out, read_rgba
@@ -23,10 +26,12 @@ from train.data.photos import Photo, find_photos
 from train.errors import UserError
 from train.evaluation.inference import predict, reconstruct
 from train.evaluation.reconstruct import MOST_IMAGES, read_pictures
+from train.evaluation.runs import open_run
 from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.statistics import spread, stacked, trainings
 from train.experiments.store import Metrics
 from train.experiments.study import Study, unchanged
+from train.methods.weights import weights_digest
 from train.show import figures
 from train.show.tables import markdown_lines
 
@@ -46,29 +51,68 @@ class PhotographedObject(NamedTuple):
     pictures: Tensor
 
 
+class _Network(NamedTuple):
+    """A network, what its weights are known by, and its configuration; its seed is that of the codes."""
+
+    key: list[Any]
+    load: Callable[[], Predictor]
+    config: FitConfig
+
+
 def make(study: Study) -> Outcome:
     """For each object of `study.pictures` the consistency loss x100 (mean chamfer distance of the pairs of its
-    pictures' predictions) after each of `_STEPS`; None for an object with a single picture, which has no pairs."""
+    pictures' predictions) after each of `_STEPS`; None for an object with a single picture, which has no pairs.
+
+    With `study.run`, of that run's network, for as many draws of codes as there are seeds.
+
+    Raises:
+        UserError: no picture that can be used, or no such run.
+    """
     objects, left_out = read_objects(study.pictures)  # before hours of training
-    configs = study.configs(unchanged)
-    study.train_all(configs)
-    found = [[_reconstruct(study, config, each) for config in configs] for each in objects]
+    study.train_all(_configs(study))
+    networks = _networks(study)
+    found = [[_reconstruct(study, network, each) for network in networks] for each in objects]
     losses = [stacked(by_seed)["losses"] for by_seed in found]  # of each object (S, 3)
     by_object: dict[str, dict[str, Any]] = {each.name: {"pictures": len(each.pictures)} for each in objects}
     for of_object, loss in zip(by_object.values(), losses, strict=True):
         for step, values in zip(_STEPS, loss.T, strict=True):
             of_object[step] = None if np.isnan(values).any() else spread(values)
-    about = {"pictures": str(study.pictures), "objects": by_object, "left_out": left_out}
-    result = study.about(configs[0]) | about
+    config = networks[0].config
+    result = study.about(config) | {
+        "profile": config.profile,  # of the run, if there is one
+        "run": str(study.run) if study.run else None,
+        "pictures": str(study.pictures),
+        "objects": by_object,
+        "left_out": left_out,
+    }
     first = [by_seed[0] for by_seed in found]
     return Outcome(result, markdown(result), {"": _figure(result, objects, first)})
 
 
-photos = Experiment(
-    make,
-    lambda study: study.configs(unchanged),
-    lambda study: sorted(filter(Path.is_file, study.pictures.rglob("*"))) if study.pictures else [],
-)
+def _configs(study: Study) -> list[FitConfig]:
+    return [] if study.run else study.configs(unchanged)
+
+
+def _networks(study: Study) -> list[_Network]:
+    """The study's trainings, or a given run's network for as many draws of codes."""
+    if study.run is None:
+        return [
+            _Network(study.weights_key(c), functools.partial(study.network, c), c) for c in _configs(study)
+        ]
+    opened = open_run(study.run, device=study.device)
+    key = ["run", weights_digest(opened.model)]
+    return [
+        _Network([*key, seed], lambda: opened.model, dataclasses.replace(opened.config, seed=seed))
+        for seed in range(study.seeds)
+    ]
+
+
+def _other_inputs(study: Study) -> list[Any]:
+    pictures = sorted(filter(Path.is_file, study.pictures.rglob("*"))) if study.pictures else []
+    return [*pictures, *([str(study.run)] if study.run else [])]
+
+
+photos = Experiment(make, _configs, _other_inputs)
 
 
 def read_objects(folder: Path | None) -> tuple[list[PhotographedObject], dict[str, str]]:
@@ -112,16 +156,18 @@ def _read(photo: Photo) -> Tensor:
     return torch.from_numpy(made.picture).permute(2, 0, 1)[None] / 255
 
 
-def _reconstruct(study: Study, config: FitConfig, found: PhotographedObject) -> Metrics:
-    """A training's reconstructions of an object.
+def _reconstruct(study: Study, network: _Network, found: PhotographedObject) -> Metrics:
+    """A network's reconstructions of an object.
 
     Returns:
         "one" (K, N, 3) from the first picture with K codes, "agreed" (V * N, 3) from all; and "losses" (3,), the
         consistency loss x100 after each of `_STEPS`, NaN for a single picture.
     """
 
+    config = network.config
+
     def measure() -> Metrics:
-        model = study.network(config)
+        model = network.load()
         one = predict(model, found.pictures[0], CODES, seed=config.seed)
         agreed = reconstruct(model, found.pictures, seed=config.seed, settings=config.inference)
         losses = torch.full((len(_STEPS),), torch.nan)
@@ -133,14 +179,17 @@ def _reconstruct(study: Study, config: FitConfig, found: PhotographedObject) -> 
 
     pictures = hashlib.sha256(found.pictures.numpy().tobytes()).hexdigest()
     settings = changed_settings(config.inference)
-    return study.kept(["photos", *study.weights_key(config), settings, CODES, pictures], measure)
+    return study.kept(["photos", *network.key, settings, CODES, pictures], measure)
 
 
 def markdown(result: Mapping[str, Any]) -> str:
     """A line for every object, and what was left out."""
+    made = trainings(result["seeds"])
+    if result.get("run"):
+        made = f"the run {result['run']}, codes drawn {result['seeds']} times"
     head = (
         f"{len(result['objects'])} objects of {result['pictures']}, profile `{result['profile']}`, "
-        f"{trainings(result['seeds'])}. There is no ground truth; the values are the disagreement of the predictions "
+        f"{made}. There is no ground truth; the values are the disagreement of the predictions "
         "for an object's pictures (consistency loss, mean chamfer distance of their pairs, x100): with random codes, "
         "with the most consistent of the searched groups of codes, and after the descent."
     )
@@ -171,7 +220,7 @@ def _figure(
             )
         )
     figure = figures.photographs_figure(rows)
-    title = f"Photographs, profile {result['profile']}, seed 0"
+    title = f"Photographs, {result.get('run') or 'profile ' + result['profile']}, seed 0"
     words = "; disagreement of the pictures' predictions (chamfer x100) with random and with agreed codes"
     figures.headline(figure, title + words if any(row.remark for row in rows) else title)
     return figure

@@ -23,7 +23,7 @@ def run_experiment(name: str, study: Study) -> dict[str, Any]:
     Raises:
         UserError: no usable data, an unknown run, or numbers out of range.
     """
-    if study.run is not None and name not in ("agreement", "coverage"):
+    if study.run is not None and name not in ("agreement", "coverage", "photos"):
         raise UserError(f"the experiment {name} trains its own networks; leave --run out")
     result = make_experiment(name, load(name), study)
     if study.progress:

@@ -82,7 +82,8 @@ class Study:
     pictures: Path | None = None
     """For photos, a folder with a folder of photographs for each object."""
     run: Path | None = None
-    """For agreement and coverage, a trained run as `open_run` takes it; networks are trained here if not given."""
+    """For agreement, coverage and photos, a trained run as `open_run` takes it; networks are trained here if not
+    given."""
     views: int = 8
     """For agreement, views per shape."""
     recipe: Recipe = "paper"
