@@ -173,6 +173,6 @@ def test_the_docs_build_without_a_warning(tmp_path):
     build = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", str(ROOT / "docs"), str(tmp_path)]
     done = subprocess.run(build, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "each a mean over its own set" in (tmp_path / "reference/distances.html").read_text(
+    assert "each reduced over its own set" in (tmp_path / "reference/distances.html").read_text(
         encoding="utf-8"
     )
