@@ -10,6 +10,7 @@ generator is called in parts.
 
 from __future__ import annotations
 
+import atexit
 import functools
 import os
 from typing import TYPE_CHECKING
@@ -229,4 +230,11 @@ def connect(device: torch.device = CPU) -> World:
     # It connects GPUs through nccl, CPUs through gloo, and gives each process the GPU of its LOCAL_RANK.
     fabric = Fabric(accelerator=device.type, strategy="ddp", devices=here, num_nodes=machines)
     fabric.launch()
+    # Threads of the connection that are still there when the interpreter ends abort the process, now and then.
+    atexit.register(_disconnect)
     return Group(fabric)
+
+
+def _disconnect() -> None:
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
