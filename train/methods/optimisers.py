@@ -157,11 +157,11 @@ def _orthogonal(matrices: list[Tensor]) -> list[Tensor]:
         xs = [nn.functional.hardshrink(x, _ROUNDING) for x in xs]
         gram = torch.stack([x @ x.T for x in xs])
         product = torch.eye(rows, dtype=gram.dtype, device=gram.device).expand_as(gram)
-        for _ in range(_TIMES):
-            higher = torch.baddbmm(
-                gram, gram, gram, beta=b, alpha=c
-            )  # without the term a: a factor of a + higher
+        for step in range(_TIMES):
+            higher = torch.baddbmm(gram, gram, gram, beta=b, alpha=c)  # the factor of this step is a + higher
             product = torch.baddbmm(product, higher, product, beta=a)
+            if step == _TIMES - 1:
+                break
             half = torch.baddbmm(gram, higher, gram, beta=a)
             gram = torch.baddbmm(half, higher, half, beta=a)
         for number, x, factor in zip(numbers, xs, product, strict=True):
