@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +28,6 @@ from train.data.render import Renderer, orbit_camera
 from train.data.solids import sample_union, surface_of
 from train.errors import UserError
 from train.evaluation.inference import predict
-from train.evaluation.runs import open_run
 from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.paper import without_codes
 from train.experiments.statistics import (
@@ -41,9 +40,8 @@ from train.experiments.statistics import (
     trainings,
 )
 from train.experiments.store import Metrics
-from train.experiments.study import Change, Study, unchanged
+from train.experiments.study import Change, Network, Study, unchanged
 from train.methods.ours import highly_diverse
-from train.methods.weights import weights_digest
 from train.processes import progress_bar
 from train.show import figures
 from train.show.tables import markdown_lines
@@ -85,35 +83,17 @@ class Object(NamedTuple):
     """`apart` -> within this distance of a back a cloud is close to it."""
 
 
-class _Network(NamedTuple):
-    """A trained network, the part of the measurements' keys that names its weights, and the seed of its codes."""
-
-    key: list[Any]
-    model: Callable[[], Predictor]
-    seed: int
-
-
 def configs(study: Study) -> list[FitConfig]:
     """Every training that the measurement needs, seed by seed."""
     return [] if study.run else study.configs(*(change for change, _ in _NETWORKS.values()))
 
 
-def _networks(study: Study) -> dict[str, tuple[list[_Network], tuple[int, ...]]]:
-    """Row -> networks and numbers of codes: of the study's trainings, or of a given run with as many draws of codes."""
+def _networks(study: Study) -> dict[str, tuple[list[Network], tuple[int, ...]]]:
+    """Row -> networks and numbers of codes: of the study's trainings, or of a given run."""
     if study.run:
-        opened = open_run(study.run, device=study.device)
-        key = ["run", weights_digest(opened.model)]
-        codes = CODES if opened.model.takes_codes else (1,)
-        draws = [_Network(key, lambda: opened.model, seed) for seed in range(study.seeds)]
-        return {str(study.run): (draws, codes)}
-    found = {}
-    for name, (change, codes) in _NETWORKS.items():
-        trained = [study.config(change, seed=seed) for seed in range(study.seeds)]
-        networks = [
-            _Network(study.weights_key(c), functools.partial(study.network, c), c.seed) for c in trained
-        ]
-        found[name] = networks, codes
-    return found
+        draws = study.networks(unchanged)
+        return {str(study.run): (draws, CODES if draws[0].load().takes_codes else (1,))}
+    return {name: (study.networks(change), codes) for name, (change, codes) in _NETWORKS.items()}
 
 
 def make(study: Study) -> Outcome:
@@ -128,9 +108,9 @@ def make(study: Study) -> Outcome:
         UserError: the first tree's test split has no object of a family that hides something, or no such run.
     """
     study.train_all(configs(study))
-    config = study.config(unchanged, seed=0) if study.run is None else open_run(study.run).config
     networks = _networks(study)
     first = next(iter(networks.values()))[0][0]
+    config = first.config
     hiders = [found for found in map(ambiguous_object, study.split(config, "test").ids) if found]
     if not hiders:
         raise UserError(
@@ -148,16 +128,15 @@ def make(study: Study) -> Outcome:
     rows: dict[str, list[Metrics]] = {}
     for name, (trained, codes) in networks.items():
         for network in trained:
-            seed = [network.seed] if study.run else []  # else the key of the weights has it
             found = study.kept(
-                ["coverage", *network.key, *seed, list(codes), *inputs],
+                ["coverage", *network.key, list(codes), *inputs],
                 lambda network=network, codes=codes: _predicted(study, network, objects(), codes),
             )
             for count in codes:
                 row = f"{name}, {count} codes" if count > 1 else name
                 rows.setdefault(row, []).append(_starting_with(f"{count}/", found))
     key = ["coverage", "without network", *first.key, *inputs]
-    found = study.kept(key, lambda: _without_network(study, config, first.model().points, objects()))
+    found = study.kept(key, lambda: _without_network(study, config, first.load().points, objects()))
     rows[_RETRIEVED] = [_starting_with(f"{CODES[0]}/", found)]
     rows[f"{CODES[0]} samples of the backs"] = [_starting_with(f"resampled {CODES[0]}/", found)]
     per_shape = {name: stacked(by_seed) for name, by_seed in rows.items()}
@@ -175,7 +154,7 @@ def make(study: Study) -> Outcome:
         },
         "claims": _claims(per_shape),
     }
-    return Outcome(result, markdown(result), {"": _figure(first.model(), hiders, size)})
+    return Outcome(result, markdown(result), {"": _figure(first.load(), hiders, size)})
 
 
 coverage = Experiment(make, configs, lambda study: [str(study.run)] if study.run else [])
@@ -282,9 +261,9 @@ def _starting_with(prefix: str, metrics: Metrics) -> Metrics:
     return {name.removeprefix(prefix): v for name, v in metrics.items() if name.startswith(prefix)}
 
 
-def _predicted(study: Study, network: _Network, objects: Sequence[Object], codes: Sequence[int]) -> Metrics:
+def _predicted(study: Study, network: Network, objects: Sequence[Object], codes: Sequence[int]) -> Metrics:
     """`_judge` over the objects of a network's predictions."""
-    model = network.model()
+    model = network.load()
     bar = progress_bar(objects, title="predictions", unit="object", progress=study.progress)
     return _over_objects(
         [_judge(obj, predict(model, obj.image, max(codes), seed=network.seed), codes) for obj in bar]
@@ -310,9 +289,7 @@ def _without_network(study: Study, config: FitConfig, points: int, objects: Sequ
 
 def markdown(result: Mapping[str, Any]) -> str:
     """A line for every row, claims, and a line for every family."""
-    made = trainings(result["seeds"]) + " of each"
-    if result["run"]:
-        made = f"the run {result['run']}, codes drawn {result['seeds']} times"
+    made = trainings(result["seeds"], run=result["run"]) + ("" if result["run"] else " of each")
     head = (
         f"{result['objects']} held-out objects whose front hides one of three backs, profile `{result['profile']}`, "
         f"{made}. Reached: share of an object's backs that are the nearest of some "

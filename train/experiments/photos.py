@@ -6,10 +6,8 @@ descent.
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +16,6 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from models import Predictor
 from train.config import FitConfig, changed_settings
 from train.data.cutout import cut_out
 from train.data.images import is_cut_out, read_rgba
@@ -26,12 +23,10 @@ from train.data.photos import Photo, find_photos
 from train.errors import UserError
 from train.evaluation.inference import predict, reconstruct
 from train.evaluation.reconstruct import MOST_IMAGES, read_pictures
-from train.evaluation.runs import open_run
 from train.experiments.frame import Experiment, Outcome, markdown_page
 from train.experiments.statistics import spread, stacked, trainings
 from train.experiments.store import Metrics
-from train.experiments.study import Study, unchanged
-from train.methods.weights import weights_digest
+from train.experiments.study import Network, Study, unchanged
 from train.show import figures
 from train.show.tables import markdown_lines
 
@@ -51,14 +46,6 @@ class PhotographedObject(NamedTuple):
     pictures: Tensor
 
 
-class _Network(NamedTuple):
-    """A network, what its weights are known by, and its configuration; its seed is that of the codes."""
-
-    key: list[Any]
-    load: Callable[[], Predictor]
-    config: FitConfig
-
-
 def make(study: Study) -> Outcome:
     """For each object of `study.pictures` the consistency loss x100 (mean chamfer distance of the pairs of its
     pictures' predictions) after each of `_STEPS`; None for an object with a single picture, which has no pairs.
@@ -70,7 +57,7 @@ def make(study: Study) -> Outcome:
     """
     objects, left_out = read_objects(study.pictures)  # before hours of training
     study.train_all(_configs(study))
-    networks = _networks(study)
+    networks = study.networks(unchanged)
     found = [[_reconstruct(study, network, each) for network in networks] for each in objects]
     losses = [stacked(by_seed)["losses"] for by_seed in found]  # of each object (S, 3)
     by_object: dict[str, dict[str, Any]] = {each.name: {"pictures": len(each.pictures)} for each in objects}
@@ -91,20 +78,6 @@ def make(study: Study) -> Outcome:
 
 def _configs(study: Study) -> list[FitConfig]:
     return [] if study.run else study.configs(unchanged)
-
-
-def _networks(study: Study) -> list[_Network]:
-    """The study's trainings, or a given run's network for as many draws of codes."""
-    if study.run is None:
-        return [
-            _Network(study.weights_key(c), functools.partial(study.network, c), c) for c in _configs(study)
-        ]
-    opened = open_run(study.run, device=study.device)
-    key = ["run", weights_digest(opened.model)]
-    return [
-        _Network([*key, seed], lambda: opened.model, dataclasses.replace(opened.config, seed=seed))
-        for seed in range(study.seeds)
-    ]
 
 
 def _other_inputs(study: Study) -> list[Any]:
@@ -156,37 +129,33 @@ def _read(photo: Photo) -> Tensor:
     return torch.from_numpy(made.picture).permute(2, 0, 1)[None] / 255
 
 
-def _reconstruct(study: Study, network: _Network, found: PhotographedObject) -> Metrics:
+def _reconstruct(study: Study, network: Network, found: PhotographedObject) -> Metrics:
     """A network's reconstructions of an object.
 
     Returns:
         "one" (K, N, 3) from the first picture with K codes, "agreed" (V * N, 3) from all; and "losses" (3,), the
         consistency loss x100 after each of `_STEPS`, NaN for a single picture.
     """
-
-    config = network.config
+    settings, seed = network.config.inference, network.seed
 
     def measure() -> Metrics:
         model = network.load()
-        one = predict(model, found.pictures[0], CODES, seed=config.seed)
-        agreed = reconstruct(model, found.pictures, seed=config.seed, settings=config.inference)
+        one = predict(model, found.pictures[0], CODES, seed=seed)
+        agreed = reconstruct(model, found.pictures, seed=seed, settings=settings)
         losses = torch.full((len(_STEPS),), torch.nan)
         if len(found.pictures) > 1:
-            random = reconstruct(model, found.pictures, seed=config.seed, groups=1, steps=0)
+            random = reconstruct(model, found.pictures, seed=seed, groups=1, steps=0)
             kept = int(agreed.kept[0])
             losses = torch.stack([random.history[0, 0], agreed.history[0, 0], agreed.history[kept, 0]])
         return {"one": one, "agreed": agreed.points[0].contiguous(), "losses": losses}
 
     pictures = hashlib.sha256(found.pictures.numpy().tobytes()).hexdigest()
-    settings = changed_settings(config.inference)
-    return study.kept(["photos", *network.key, settings, CODES, pictures], measure)
+    return study.kept(["photos", *network.key, changed_settings(settings), CODES, pictures], measure)
 
 
 def markdown(result: Mapping[str, Any]) -> str:
     """A line for every object, and what was left out."""
-    made = trainings(result["seeds"])
-    if result.get("run"):
-        made = f"the run {result['run']}, codes drawn {result['seeds']} times"
+    made = trainings(result["seeds"], run=result.get("run"))
     head = (
         f"{len(result['objects'])} objects of {result['pictures']}, profile `{result['profile']}`, "
         f"{made}. There is no ground truth; the values are the disagreement of the predictions "

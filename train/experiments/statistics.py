@@ -77,13 +77,17 @@ def percent_text(found: Mapping[str, Any]) -> str:
     return f"{found['mean']:.0%}" + ("" if found["sd"] is None else f" ± {100 * found['sd']:.0f}")
 
 
-def trainings(count: int) -> str:
-    """So many trainings, in words.
+def trainings(count: int, *, run: str | None = None) -> str:
+    """So many trainings, or draws of codes for the network of a given run, in words.
 
     Example:
         >>> trainings(1)
         '1 training'
+        >>> trainings(3, run="pretrained")
+        'the run pretrained, codes drawn 3 times'
     """
+    if run:
+        return f"the run {run}, codes drawn {count} times"
     return f"{count} training{'s' if count > 1 else ''}"
 
 

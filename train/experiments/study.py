@@ -16,7 +16,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 
@@ -35,12 +35,13 @@ from train.device import CPU, prepare
 from train.errors import UserError
 from train.evaluation.per_shape import SHAPES_AT_ONCE, compare_clouds, concatenate, evaluate_split, on_cpu
 from train.evaluation.retrieval import medoid, nearest_by_image
-from train.evaluation.runs import best_weights, load_predictor, read_split
+from train.evaluation.runs import best_weights, load_predictor, open_run, read_split
 from train.experiments import store
 from train.experiments.store import Metrics, NotMeasured
 from train.files import write_text
 from train.methods import get_method
 from train.methods import recipe as recipe_of
+from train.methods.weights import weights_digest
 from train.processes import run_in_processes
 from train.training import TRAINING_VERSION
 from train.training.trainer import fit
@@ -55,6 +56,17 @@ _NOT_OF_THE_WEIGHTS = (
 )  # fmt: skip
 # The error of a method on its training shapes is measured on so many of them.
 _SOME_TRAINING_SHAPES = 100
+
+
+class Network(NamedTuple):
+    """A network to measure with one draw of codes."""
+
+    key: list[Any]
+    """The part of a measurement's key that names its weights and the draw."""
+    load: Callable[[], Predictor]
+    config: FitConfig
+    seed: int
+    """Of the codes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,6 +240,19 @@ class Study:
         run = self.train(config, stage=stage)
         weights = best_weights(run, stage) if f"stage{stage}" in config.phases else run
         return load_predictor(weights, device=self.device)
+
+    def networks(self, change: Change) -> list[Network]:
+        """The trainings of a variant with every seed; or the network of `run`, for as many draws of codes."""
+        if self.run is None:
+            return [
+                Network(self.weights_key(c), functools.partial(self.network, c), c, c.seed)
+                for c in self.configs(change)
+            ]
+        opened = open_run(self.run, device=self.device)
+        key = ["run", weights_digest(opened.model)]
+        return [
+            Network([*key, seed], lambda: opened.model, opened.config, seed) for seed in range(self.seeds)
+        ]
 
     # Measurements
 
