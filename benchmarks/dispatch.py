@@ -90,7 +90,7 @@ def _register_bare(
     """Replaces `_bridge.register`: an `autograd.Function` instead of a torch operator."""
 
     def decorate(function: Callable) -> Callable:
-        function = _bridge._on_cpu_tensors(function, strided)
+        function = _bridge._on_any_device(name, function, strided)
         if backward is None or setup is None:
             return function
         members = SimpleNamespace(

@@ -21,6 +21,7 @@ from benchmarks.inputs import circle_of_cameras, depth_maps, leaf, leaf_camera, 
 
 POINTS = 100_000
 _CHOSEN = 4_096
+_MATCHED = 8_192
 _PIXELS = 316  # by 316, about as many as points
 
 
@@ -79,6 +80,9 @@ def _on(call: Callable[..., Any], *inputs: torch.Tensor) -> Callable[[], Any]:
 OPS: dict[str, Callable[[], Callable[[], Any]]] = {
     f"farthest_point_sample of {_CHOSEN}": lambda: _on(
         lambda x: dp.farthest_point_sample(x, _CHOSEN), surfaces(1, POINTS)
+    ),
+    f"earth_mover_distance of {_MATCHED}": lambda: _on(
+        dp.earth_mover_distance, *pairs(1, _MATCHED, _MATCHED)
     ),
     "chamfer_distance": lambda: _on(
         lambda a, b: dp.chamfer_distance(a, b, squared=True), *pairs(1, POINTS, POINTS)

@@ -35,7 +35,7 @@ STOP, BID, MEASURE, MEASURE_START = 0, 1, 2, 3  # what the auction of a pair doe
 LEFT, ROUND, OVER = 0, 16, 32
 # How often the thread of a pair looks for the scan of a helper before it scans itself, for every 16 objects.
 PATIENCE = 8
-MOST_IDLE = 200_000  # how often a helper looks for work in vain
+MOST_IDLE = 2_000_000  # how often a helper looks for work in vain: bids from lists can go on for milliseconds
 
 
 def build(real):
@@ -198,8 +198,8 @@ def build(real):
                         n = ti.cast(person_counts[pair], ti.i32)
                         over = 0
                         idle = 0
-                        # It gives up where there is nothing to do for milliseconds: the thread of the pair has lost its
-                        # core, which this one must not keep busy.
+                        # It gives up where there is nothing to do for tens of milliseconds: the thread of the pair has
+                        # lost its core, which this one must not keep busy.
                         while over == 0 and idle < MOST_IDLE:
                             idle += 1
                             # Atomic accesses are also barriers: the compiler reads memory anew after them.
