@@ -9,6 +9,7 @@ import torch
 
 from train.data.augment import augment
 from train.data.batches import load_split
+from train.data.cutout import FILL, LONGEST
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +56,31 @@ def test_white_comes_in_from_outside_where_the_object_moves(images: torch.Tensor
     assert (moved[:, :, 0, 0] > 0.5).any(), "no corner was moved into the picture"
     middle = moved[:, :, 20:28, 28:36]
     assert middle.mean() < 0.1, "the object in the middle should have stayed dark"
+
+
+def test_framed_images_show_the_object_as_photographs_do(images: torch.Tensor) -> None:
+    seeds = torch.arange(len(images))
+    assert torch.equal(augment(images, 0.0, seeds, framing=0.0), augment(images, 0.0, seeds))
+    height, width = images.shape[-2:]
+    for framed in augment(images, 0.0, seeds, framing=1.0):
+        rows, columns = (framed.amin(0).amin(dim).lt(0.9).nonzero() for dim in (1, 0))
+        ends = torch.tensor(
+            [
+                [rows.min() / height, columns.min() / width],
+                [(rows.max() + 1) / height, (columns.max() + 1) / width],
+            ]
+        )
+        extent = ends[1] - ends[0]
+        assert ends.mean(0) == pytest.approx([0.5, 0.5], abs=0.03)
+        assert extent.max() == pytest.approx(LONGEST, abs=0.06) or extent.norm() == pytest.approx(
+            FILL, abs=0.06
+        )
+    white = torch.ones_like(images)
+    torch.testing.assert_close(augment(white, 0.0, seeds, framing=1.0), white)
+
+
+def test_framing_changes_its_share_of_the_images(images: torch.Tensor) -> None:
+    same = images[:1].expand(400, -1, -1, -1)
+    changed = augment(same, 0.0, torch.arange(400), framing=0.3)
+    share = ((changed - same).abs().amax((1, 2, 3)) > 0.1).float().mean()
+    assert 0.2 < share < 0.4

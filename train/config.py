@@ -216,6 +216,9 @@ class FitConfig:
     augmentation: float = 0.0
     """Strength of random changes of light, colour, sharpness, noise, size and place of the training images; 0: none, 1:
     as much as photographs need."""
+    framing: float = 0.0
+    """Share of the training images whose object is framed as in a photograph, in the middle and about as large in every
+    one; for networks that shall read photographs."""
     precision: Precision = "float32"
     """Number format of the generator during training, all layers but the last. bfloat16 is about twice as fast on GPUs
     and on processors that can multiply such numbers (avx512_bf16, amx; see lscpu), slower elsewhere, and on a CPU

@@ -1,8 +1,9 @@
 """Random changes of training images, so that a network that has seen only clean renders can read photographs.
 
-Photographs reach the network cut out on white (train/data/photos.py). What differs from a render still: light and
-colour, a blurred or compressed picture, an object not quite in the middle, a background not quite white.
-The object in the picture stays the same one, so its depth map and its whole shape remain the right answers.
+Photographs reach the network cut out on white (train/data/photos.py). What differs from a render still: the frame, which
+is drawn around the object, not around where it could be; light and colour, a blurred or compressed picture, an object
+not quite in the middle, a background not quite white. The object in the picture stays the same one, so its depth map and
+its whole shape remain the right answers.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from train.data.cutout import FILL, LONGEST
 from train.device import moved
 
 # At strength 1; each is drawn uniformly up to these values in both directions, where a direction makes sense.
@@ -30,7 +32,7 @@ _SPOILT_SHARE = 0.5
 _WHITE = 0.98
 
 
-def augment(images: Tensor, strength: float, seeds: Tensor) -> Tensor:
+def augment(images: Tensor, strength: float, seeds: Tensor, *, framing: float = 0.0) -> Tensor:
     """Changes light, colour, sharpness, size and place of each image at random.
 
     Args:
@@ -38,6 +40,8 @@ def augment(images: Tensor, strength: float, seeds: Tensor) -> Tensor:
         strength: 0 changes nothing; 1 is as much as photographs need.
         seeds: (B,) int64 on the CPU, one for each image: what happens to an image does not depend on those beside it,
             nor on the device, but for rounding.
+        framing: share of the images whose object is framed as `cutout` frames a photograph, in the middle and about as
+            large in every one: a render shows a distant or an end-on object small.
 
     Returns:
         (B, 3, H, W) in [0, 1].
@@ -53,7 +57,16 @@ def augment(images: Tensor, strength: float, seeds: Tensor) -> Tensor:
     def sometimes(values: Tensor) -> Tensor:
         return torch.where(next(unused) < _SPOILT_SHARE, values, 0)
 
-    images = _move(images, shift=draw(_SHIFT, 2), scale=1 + draw(_SCALE), turn=draw(_TURN))
+    middle, side = _frames(images)
+    framed = numbers[:, -1] < framing
+    images = _move(
+        images,
+        middle=torch.where(framed[:, None], middle, 0),
+        side=torch.where(framed, side, 1),
+        shift=draw(_SHIFT, 2),
+        scale=1 + draw(_SCALE),
+        turn=draw(_TURN),
+    )
     empty = (images.amin(1, keepdim=True) >= _WHITE).to(images.dtype)
     mix = torch.eye(3, device=images.device) + draw(_COLOUR_MIX, 3, 3)
     coloured = torch.einsum("bij,bjhw->bihw", mix / mix.sum(-1, keepdim=True), images)
@@ -79,14 +92,38 @@ def _random_numbers(images: Tensor, seeds: Tensor) -> tuple[Tensor, Tensor]:
     return moved(torch.stack(uniform), images.device), moved(torch.stack(normal), images.device)
 
 
-def _move(images: Tensor, *, shift: Tensor, scale: Tensor, turn: Tensor) -> Tensor:
-    """Shifts (of the image's side), scales and turns; white comes in from outside."""
+def _frames(images: Tensor) -> tuple[Tensor, Tensor]:
+    """The frame of a photograph around each object: its middle (B, 2), in [-1, 1], and its side (B,), 1 for the whole
+    picture. That is the frame where nothing is to be seen."""
+    covered = images.amin(1) < _WHITE
+    ends = []
+    for on_axis in (covered.any(1), covered.any(2)):  # columns, rows
+        size = on_axis.shape[1]
+        place = torch.arange(size, device=images.device).expand_as(on_axis)
+        ends.append(
+            (
+                torch.where(on_axis, place, size).amin(1) / size,
+                torch.where(on_axis, place + 1, 0).amax(1) / size,
+            )
+        )
+    first, last = (torch.stack(each, 1) for each in zip(*ends, strict=True))
+    extent = last - first
+    side = torch.maximum(extent.norm(dim=1) / FILL, extent.amax(1) / LONGEST)
+    empty = ~covered.flatten(1).any(1)
+    return (first + last - 1).masked_fill(empty[:, None], 0), side.masked_fill(empty, 1)
+
+
+def _move(
+    images: Tensor, *, middle: Tensor, side: Tensor, shift: Tensor, scale: Tensor, turn: Tensor
+) -> Tensor:
+    """Cuts frames out (see `_frames`), shifts (in sides of the frame), scales and turns; white comes in from outside."""
     height, width = images.shape[-2:]
-    cosine, sine = torch.cos(turn) / scale, torch.sin(turn) / scale
+    cosine, sine = side * torch.cos(turn) / scale, side * torch.sin(turn) / scale
     ratio = height / width
+    offset = middle + 2 * side[:, None] * shift
     rows = [
-        torch.stack([cosine, -sine * ratio, 2 * shift[:, 0]], -1),
-        torch.stack([sine / ratio, cosine, 2 * shift[:, 1]], -1),
+        torch.stack([cosine, -sine * ratio, offset[:, 0]], -1),
+        torch.stack([sine / ratio, cosine, offset[:, 1]], -1),
     ]
     places = F.affine_grid(torch.stack(rows, 1), list(images.shape), align_corners=False)
     return 1 - F.grid_sample(1 - images, places, align_corners=False)

@@ -289,9 +289,10 @@ class Trainer:
             mix = torch.rand(phase.n_critic, phase.codes, images, generator=self._random)
             real = [self._clouds(shapes), *(self._draw_clouds(phase.shapes) for _ in range(phase.real_pool))]
             batch = batch._replace(real=shard(torch.stack(real), 1))
-        if self.config.augmentation > 0:
+        strength, framing = self.config.augmentation, self.config.framing
+        if strength > 0 or framing > 0:
             seeds = shard(torch.randint(2**62, (images,), generator=self._random))
-            changed = augment(batch.images.flatten(0, 1), self.config.augmentation, seeds)
+            changed = augment(batch.images.flatten(0, 1), strength, seeds, framing=framing)
             batch = batch._replace(images=changed.view(batch.images.shape))
         if self.method.needs_targets(phase):
             batch = batch._replace(targets=self._train.targets(shard(shapes)))
