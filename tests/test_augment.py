@@ -84,3 +84,16 @@ def test_framing_changes_its_share_of_the_images(images: torch.Tensor) -> None:
     changed = augment(same, 0.0, torch.arange(400), framing=0.3)
     share = ((changed - same).abs().amax((1, 2, 3)) > 0.1).float().mean()
     assert 0.2 < share < 0.4
+
+
+def test_a_framed_split_has_framed_pictures(tiny_data: Path) -> None:
+    split = load_split(tiny_data, "train", image_size=(48, 64), map_size=16, progress=False)
+    shapes, views = torch.arange(3), torch.tensor([[0, 2], [1, 0], [2, 1]])
+    images = split.float_images(shapes, views).flatten(0, 1)
+    expected = augment(images, 0.0, torch.arange(6), framing=1.0)
+    found = split.framed().float_images(shapes, views).flatten(0, 1)
+    torch.testing.assert_close(
+        found, expected, atol=0.03, rtol=0
+    )  # pixels whiter than 0.98 become white there
+    assert (found - images).abs().amax((1, 2, 3)).max() > 0.5
+    assert split.framed().images[0][:].shape == split.images[0].shape

@@ -208,6 +208,12 @@ def test_evaluation_is_repeatable(smoke_run: Path, tiny_data: Path, tmp_path: Pa
         for i in range(2)
     )
     assert first == again
+    out = tmp_path / "framed.json"
+    framed = evaluate(smoke_run, tiny_data, views=(2,), framed=True, out=out, progress=False)
+    assert framed["data"]["framed"] and not first["data"]["framed"]
+    assert framed["views"] != first["views"], "other pictures give other predictions"
+    assert framed["nearest_image"] != first["nearest_image"]
+    assert framed["medoid"] == first["medoid"]
 
 
 # --- search and descent on the codes

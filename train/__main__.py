@@ -203,6 +203,8 @@ class Evaluate:
     """Numbers of views, as 1,2,4,8 or apart."""
     limit: int | None = None
     """Score at most that many shapes."""
+    framed: bool = False
+    """Show the network every object as photographs are framed: in the middle, as large as the frame allows."""
     out: Path | None = None
     """Where to write; RUN/evaluation.json if not given."""
     device: Device = "auto"
@@ -217,6 +219,7 @@ class Evaluate:
             seeds=self.seeds,
             views=self.views,
             limit=self.limit,
+            framed=self.framed,
             out=self.out,
             device=_use_device(self.device),
         )

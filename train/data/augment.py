@@ -1,13 +1,14 @@
 """Random changes of training images, so that a network that has seen only clean renders can read photographs.
 
-Photographs reach the network cut out on white (train/data/photos.py). What differs from a render still: the frame, which
-is drawn around the object, not around where it could be; light and colour, a blurred or compressed picture, an object
-not quite in the middle, a background not quite white. The object in the picture stays the same one, so its depth map and
-its whole shape remain the right answers.
+Photographs reach the network cut out on white (train/data/photos.py). What differs from a render still: the frame,
+which is drawn around the object, not around where it could be; light and colour, a blurred or compressed picture, an
+object not quite in the middle, a background not quite white. The object in the picture stays the same one, so its depth
+map and its whole shape remain the right answers.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from train.data.cutout import FILL, LONGEST
+from train.data.packed import PackedViews
 from train.device import moved
 
 # At strength 1; each is drawn uniformly up to these values in both directions, where a direction makes sense.
@@ -59,10 +61,10 @@ def augment(images: Tensor, strength: float, seeds: Tensor, *, framing: float = 
 
     middle, side = _frames(images)
     framed = numbers[:, -1] < framing
-    images = _move(
+    images = _cut(
         images,
-        middle=torch.where(framed[:, None], middle, 0),
-        side=torch.where(framed, side, 1),
+        torch.where(framed[:, None], middle, 0),
+        torch.where(framed, side, 1),
         shift=draw(_SHIFT, 2),
         scale=1 + draw(_SCALE),
         turn=draw(_TURN),
@@ -92,6 +94,27 @@ def _random_numbers(images: Tensor, seeds: Tensor) -> tuple[Tensor, Tensor]:
     return moved(torch.stack(uniform), images.device), moved(torch.stack(normal), images.device)
 
 
+@dataclasses.dataclass(frozen=True)
+class FramedViews:
+    """The views (V, 3, h, w) uint8 of a shape, each framed as `cutout` frames a photograph when it is read."""
+
+    views: PackedViews | Tensor
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.views.shape)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.views.dtype
+
+    def __getitem__(self, chosen: Tensor | slice) -> Tensor:
+        images = self.views[chosen].float() / 255
+        zero, one = images.new_zeros(len(images)), images.new_ones(len(images))
+        framed = _cut(images, *_frames(images), shift=images.new_zeros(len(images), 2), scale=one, turn=zero)
+        return (framed * 255).round().to(torch.uint8)
+
+
 def _frames(images: Tensor) -> tuple[Tensor, Tensor]:
     """The frame of a photograph around each object: its middle (B, 2), in [-1, 1], and its side (B,), 1 for the whole
     picture. That is the frame where nothing is to be seen."""
@@ -113,10 +136,11 @@ def _frames(images: Tensor) -> tuple[Tensor, Tensor]:
     return (first + last - 1).masked_fill(empty[:, None], 0), side.masked_fill(empty, 1)
 
 
-def _move(
-    images: Tensor, *, middle: Tensor, side: Tensor, shift: Tensor, scale: Tensor, turn: Tensor
+def _cut(
+    images: Tensor, middle: Tensor, side: Tensor, *, shift: Tensor, scale: Tensor, turn: Tensor
 ) -> Tensor:
-    """Cuts frames out (see `_frames`), shifts (in sides of the frame), scales and turns; white comes in from outside."""
+    """Cuts out frames (see `_frames`) and shifts (in sides of the frame), scales and turns them; white comes in from
+    outside."""
     height, width = images.shape[-2:]
     cosine, sine = side * torch.cos(turn) / scale, side * torch.sin(turn) / scale
     ratio = height / width

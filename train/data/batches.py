@@ -22,6 +22,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from diffpoint import PinholeCamera
+from train.data.augment import FramedViews
 from train.data.cache import prepare
 from train.data.packed import PackedShape, PackedViews
 from train.data.shrink import Pool, Sizes
@@ -45,7 +46,7 @@ class LoadedSplit:
         categories: category name of every shape.
     """
 
-    images: Sequence[PackedViews] | Tensor
+    images: Sequence[PackedViews | FramedViews] | Tensor
     depth: Sequence[PackedViews] | Tensor
     K: Tensor
     cam_from_world: Tensor
@@ -86,6 +87,10 @@ class LoadedSplit:
             moving[name] = getattr(self, name).to(device)
         return dataclasses.replace(self, **moving)
 
+    def framed(self) -> LoadedSplit:
+        """The same with pictures framed as photographs are: the object in the middle, as large as the frame allows."""
+        return dataclasses.replace(self, images=[FramedViews(views) for views in self.images])
+
     @property
     def fingerprint(self) -> str:
         """Changes when shapes, views or ground truth change."""
@@ -118,7 +123,9 @@ class LoadedSplit:
         """(B,) shape and (B, N) point numbers -> (B, N, 3) of the ground truth."""
         return self.points[moved(shapes[:, None], self.device), moved(points, self.device)]
 
-    def _picked(self, values: Sequence[PackedViews] | Tensor, shapes: Tensor, views: Tensor) -> Tensor:
+    def _picked(
+        self, values: Sequence[PackedViews | FramedViews] | Tensor, shapes: Tensor, views: Tensor
+    ) -> Tensor:
         """M of (V, ...), (B,) shape and (B, V') view numbers -> (B, V', ...)."""
         if isinstance(values, Tensor):
             return values[moved(shapes[:, None], self.device), moved(views, self.device)]
@@ -126,11 +133,11 @@ class LoadedSplit:
         return moved(torch.stack(picked), self.device)
 
 
-def _unpacked_bytes(values: Sequence[PackedViews]) -> int:
+def _unpacked_bytes(values: Sequence[PackedViews | FramedViews]) -> int:
     return len(values) * math.prod(values[0].shape) * values[0].dtype.itemsize
 
 
-def _unpacked(values: Sequence[PackedViews], device: torch.device) -> Tensor:
+def _unpacked(values: Sequence[PackedViews | FramedViews], device: torch.device) -> Tensor:
     """(M, V, ...)."""
     found = torch.empty((len(values), *values[0].shape), dtype=values[0].dtype, device=device)
     for into, packed in zip(found, values, strict=True):

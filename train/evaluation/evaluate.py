@@ -62,6 +62,7 @@ def evaluate(
     seeds: Sequence[int] = (0,),
     views: Sequence[int] = VIEW_COUNTS,
     limit: int | None = None,
+    framed: bool = False,
     out: str | Path | None = None,
     progress: bool = True,
     device: torch.device = CPU,
@@ -76,6 +77,7 @@ def evaluate(
         seeds: each determines the random codes and the choice of views; metrics are means over seeds.
         views: numbers of input views; those larger than the data have are skipped.
         limit: evaluate at most this many shapes of the split.
+        framed: show the network each object as photographs are framed, in the middle and as large as the frame allows.
         out: the file to write; RUN/evaluation.json by default.
         progress: show progress bars and print the table.
         device: where everything is computed.
@@ -96,6 +98,8 @@ def evaluate(
         out = folder / "evaluation.json"
     test = opened.load_split(data, split, limit=limit, progress=progress)
     train = opened.load_split(data, "train", progress=progress)
+    if framed:
+        test, train = test.framed(), train.framed()
     counts = sorted({n for n in views if n <= test.views})
     if not counts:
         raise UserError(f"{data} has {test.views} views per shape; none of {list(views)} can be evaluated")
@@ -107,6 +111,7 @@ def evaluate(
         "data": {
             "path": str(data),
             "split": split,
+            "framed": framed,
             "shapes": len(test),
             "fingerprint": test.fingerprint,
             "train_shapes": len(train),
