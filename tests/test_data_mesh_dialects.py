@@ -124,7 +124,17 @@ def _stl(kind: Callable[[trimesh.Trimesh], str | bytes]) -> bytes:
 _TEXT, _BINARY = _stl(trimesh.exchange.stl.export_stl_ascii), _stl(trimesh.exchange.stl.export_stl)
 
 
-@pytest.mark.parametrize("content", [_TEXT, _TEXT.upper(), _BINARY, b"solid" + _BINARY[5:]])
+@pytest.mark.parametrize(
+    "content",
+    [
+        _TEXT,
+        _TEXT.upper(),
+        _BINARY,
+        b"solid" + _BINARY[5:],
+        b"solid facet" + _BINARY[11:],
+        _BINARY + b"of another program",
+    ],
+)
 def test_stl_dialects(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.stl").write_bytes(content)
     assert _is_the_box(tmp_path / "a.stl")
@@ -139,6 +149,8 @@ def test_stl_dialects(content: bytes, tmp_path: Path) -> None:
         ("a.stl", _TEXT[:-300], "ends early"),
         ("a.stl", b"solid" + _BINARY[5:-60], "says 12 triangles and holds 10"),
         ("a.stl", b"", "holds 0"),
+        ("a.off", b"", "does not start with OFF"),
+        ("a.off", b"OFF BINARY\n" + bytes(12), "save it as text"),
         ("a.obj", _VERTICES.encode(), "no faces: points and lines"),
         ("a.obj", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
     ],

@@ -87,6 +87,9 @@ def test_files_that_are_not_found_are_named(tmp_path: Path) -> None:
         ("COFF 4 4 0", "1.0 0.0 0.0 1.0", ""),
         ("OFF\n4 4 6", "", "255 0 0"),
         ("OFF\n4 4 6", "", "1.0 0.0 0.0 1.0"),
+        ("OFF4 4 6", "", "255 0 0"),  # as in ModelNet
+        ("NOFF\n4 4 6", "0 0 1", "255 0 0"),
+        ("STCNOFF\n4 4 6", "0 0 1 255 0 0 255 0.5 0.5", ""),
     ],
 )
 def test_colours_of_off_files(head: str, of_vertex: str, of_face: str, tmp_path: Path) -> None:

@@ -140,14 +140,17 @@ def _polygons_of_ply(mesh: trimesh.Trimesh) -> np.ndarray | Sequence[np.ndarray]
 
 
 def read_off(content: bytes, files: Any) -> trimesh.Scene:
-    """Reads an OFF file with the colours of its vertices (COFF) or faces."""
+    """Reads an OFF file with the colours of its vertices (COFF) or faces; normals (NOFF) are skipped."""
     text = re.sub(r"#.*", "", obj_text.as_text(content).decode())
     lines = [line.split() for line in text.splitlines() if line.strip()]
-    match = re.fullmatch(r"(C?)OFF", lines[0][0], re.IGNORECASE)
+    # ModelNet has files whose first line is "OFF490 518 0".
+    match = re.fullmatch(r"(?:ST)?(C?)(N?)OFF(\d*)", lines[0][0] if lines else "", re.IGNORECASE)
     if not match:
-        raise ValueError("does not start with OFF or COFF")
-    lines[0] = lines[0][1:]
+        raise ValueError("does not start with OFF, COFF, NOFF or CNOFF")
+    lines[0] = [word for word in (match[3], *lines[0][1:]) if word]
     lines = lines if lines[0] else lines[1:]
+    if lines[:1] == [["BINARY"]]:
+        raise ValueError("a binary OFF file: save it as text")
     vertex_count, face_count = map(int, lines[0][:2])
     of_vertices, of_faces = lines[1 : 1 + vertex_count], lines[1 + vertex_count :][:face_count]
     if len(of_faces) < face_count:
@@ -160,7 +163,8 @@ def read_off(content: bytes, files: Any) -> trimesh.Scene:
         colours += [line[1 + len(polygon) :]] * len(triangles)
     given: dict[str, Any] = {}
     if match[1]:
-        given["vertex_colors"] = _colours([line[3:] for line in of_vertices])
+        first = 6 if match[2] else 3
+        given["vertex_colors"] = _colours([line[first:] for line in of_vertices])
     elif colours and all(len(colour) >= 3 for colour in colours):
         given["face_colors"] = _colours(colours)
     triangles = np.array(faces, int).reshape(-1, 3)
@@ -187,14 +191,16 @@ def _load(content: bytes, kind: str, files: Any) -> trimesh.Scene:
 
 def read_stl(content: bytes, files: Any) -> trimesh.Scene:
     """Reads an STL file, in text or binary, which must be whole."""
-    is_text = content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
-    if is_text:
+    count = int.from_bytes(content[80:84], "little")  # of a text, four letters: more than any file holds
+    whole = 84 + 50 * count
+    if count and len(content) >= whole:
+        return _load(content[:whole], "stl", files)  # trimesh takes a file with more behind it for text
+    if content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower():
         if b"endsolid" not in content[-4096:].lower():
             raise ValueError("the file ends early: endsolid is missing")
-    elif len(content) < 84 + 50 * (count := int.from_bytes(content[80:84], "little")) or not count:
-        held = max(len(content) - 84, 0) // 50
-        raise ValueError(f"neither text nor a whole binary file: it says {count} triangles and holds {held}")
-    return _load(content, "stl_ascii" if is_text else "stl", files)
+        return _load(content, "stl_ascii", files)
+    held = max(len(content) - 84, 0) // 50
+    raise ValueError(f"neither text nor a whole binary file: it says {count} triangles and holds {held}")
 
 
 READERS: dict[str, Callable[[bytes, Any], trimesh.Scene]] = {
