@@ -22,7 +22,7 @@ from train.data.images import decode, read_images, read_rgba
 from train.data.layouts import layout_of, pictures_of, require_depth
 from train.data.mesh_sources import find_meshes, read_labels
 from train.data.meshes import convert, load_surface
-from train.data.photos import convert_photos, find_photos
+from train.data.photos import convert_photos, find_photos, is_mask, mask_of, masks_in
 from train.data.procedural import generate
 from train.data.shrink import Sizes
 from train.data.tree import frame_of, read_shape
@@ -59,6 +59,7 @@ CALLS = {
     "read_images": lambda p, at: read_images([p(at / "photos" / "a.png")]).sum().item(),
     "read_rgba": lambda p, at: read_rgba(p(at / "photos" / "a.png")).sum(),
     "pictures_of": lambda p, at: pictures_of(p(at / "photos")),
+    "masks": lambda p, at: (is_mask(p(at / "masks" / "a.png")), mask_of(p(at / "a"), masks_in(p(at / "photos")))),
     "files": lambda p, at: (write_text(p(at / "a"), "a"), kept(p(at / "k"), 1, lambda: 2), remove(p(at / "a"))),
 }  # fmt: skip
 

@@ -16,6 +16,7 @@ from train.data.cutout import FILL, NotPlain, cut_out, find_foreground
 from train.data.images import read_rgba
 from train.data.photos import convert_photos, find_photos
 from train.errors import UserError
+from train.evaluation.reconstruct import image_files, read_pictures
 from train.methods.weights import save_weights
 
 WHITE, CREAM, BLUE = (0.95, 0.95, 0.94), (0.93, 0.9, 0.82), (0.75, 0.82, 0.9)
@@ -153,6 +154,43 @@ def test_a_given_mask_goes_first_then_alpha(tmp_path):
         picture = np.asarray(Image.open(tmp_path / "out" / name / "a.png"))
         assert np.hypot(*box_of(inked(picture))) / 224 == pytest.approx(FILL, abs=0.03)
         assert np.abs(picture[112, 112].astype(int) - (200, 30, 30)).max() < 6
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("A_mask.PNG", "grey"),
+        ("a_MASK.png", "grey"),
+        ("Masks/a.png", "grey"),
+        ("a_mask.png", "0 and 1"),
+        ("a_mask.png", "16 bits"),
+        ("a_mask.png", "palette"),
+    ],
+)
+def test_masks_of_other_programs(name, values, tmp_path):
+    source, mask = tmp_path / "in", disc().astype(np.uint8)
+    (source / name).parent.mkdir(parents=True)
+    Image.fromarray(lawn()).save(source / "a.jpg")
+    palette = Image.fromarray(mask)
+    palette.putpalette([0, 0, 0, 128, 0, 0])
+    made = {"grey": mask * 255, "0 and 1": mask, "16 bits": mask.astype(np.uint16) * 255}
+    picture = palette if values == "palette" else Image.fromarray(made[values])
+    picture.save(source / name, format="PNG")
+    assert convert_photos(source, tmp_path / "out", processes=1).ways == {"mask": 1}
+    assert np.array_equal(read_mask(tmp_path / "out" / "in" / "masks" / "a.png"), disc())
+    # reconstruct takes the same masks, and they are no pictures of the object.
+    (source / "._a.jpg").write_bytes(b"what macOS notes of the file")
+    assert image_files([source]) == [source / "a.jpg"]
+    red, green, _ = read_pictures([source / "a.jpg"])[0, :, 112, 112].tolist()
+    assert red > 0.7 > 0.2 > green
+    assert read_pictures([source / "a.jpg"])[0, :, 0, 0].tolist() == [1, 1, 1]
+
+
+def test_reconstruct_refuses_a_mask_that_does_not_fit(tmp_path):
+    Image.fromarray(lawn()).save(tmp_path / "a.jpg")
+    Image.fromarray(disc(100, 30, (50, 50))).save(tmp_path / "a_mask.png")
+    with pytest.raises(UserError, match=r"a\.jpg: its mask is 100 x 100 pixels, the photograph 240 x 240"):
+        read_pictures([tmp_path / "a.jpg"])
 
 
 def test_a_mask_that_came_out_can_be_corrected_and_given_back(studio, cut, tmp_path):

@@ -69,8 +69,9 @@ def cut_out(rgba: np.ndarray, *, size: int = 224, given: np.ndarray | None = Non
     Args:
         rgba: (H, W, 4) in [0, 1].
         size: side of the picture that is made.
-        given: (H, W, 4) in [0, 1], a mask: its alpha channel if that is transparent anywhere, else its brightness.
-            Without one, the photograph's own alpha is used, and if that is opaque the background has to be plain.
+        given: (H, W, 4) in [0, 1], a mask: its alpha channel if that is transparent anywhere, else its brightness; of
+            two values the brighter one marks the object, whatever it is. Without one, the photograph's own alpha is
+            used, and if that is opaque the background has to be plain.
 
     Raises:
         UserError: a mask of another size, an empty mask, or a background that is not plain.
@@ -104,7 +105,13 @@ def _mask_values(given: np.ndarray, height: int, width: int) -> np.ndarray:
             f"its mask is {given.shape[1]} x {given.shape[0]} pixels, the photograph {width} x {height}; "
             "make them the same size"
         )
-    return given[..., 3] if (given[..., 3] < 0.5).any() else given[..., :3].mean(2)
+    if (given[..., 3] < 0.5).any():
+        return given[..., 3]
+    values = given[..., :3].mean(2)
+    low, high = values.min(), values.max()
+    # Programs that segment pictures write 0 and 1 of 255, or a colour.
+    has_two_values = low < high and bool(((values == low) | (values == high)).all())
+    return (values == high).astype(np.float32) if has_two_values else values
 
 
 def _segment(image: Image.Image) -> tuple[np.ndarray, Foreground]:

@@ -33,8 +33,10 @@ MASKS = "masks"
 
 _PRODUCTS = "_final"
 _LISTING = re.compile(r"(\d+)_(\d+)")
-_MASK_FOLDERS = (MASKS, "mask")
+_MASK, _MASK_FOLDERS = "_mask", (MASKS, "mask")
 _RECORD = "photos.json"
+
+Masks = dict[str, Path]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,19 +176,19 @@ def find_photos(source: str | Path) -> tuple[dict[str, list[Photo]], dict[str, s
     for path in sorted(source.rglob("*")):
         inside = path.relative_to(source)
         hidden = any(part.startswith(".") for part in inside.parts)
-        if hidden or path.parent.name in _MASK_FOLDERS or path.stem.endswith("_mask") or not path.is_file():
+        if hidden or is_mask(path) or not path.is_file():
             continue
         if path.suffix.lower() in PICTURE_SUFFIXES:
             by_folder[path.parent].append(path)
         elif path.suffix.lower() in UNREADABLE_SUFFIXES:
             failures[str(inside)] = f"{path.suffix} pictures cannot be read; save it as JPEG or PNG"
     found: dict[str, list[Photo]] = defaultdict(list)
-    for paths in by_folder.values():
-        stems = Counter(path.stem for path in paths)
+    for folder, paths in by_folder.items():
+        stems, masks = Counter(path.stem for path in paths), masks_in(folder)
         for path in paths:
             name = path.stem if stems[path.stem] == 1 else path.name.replace(".", "_")
             title = _object_of(path, paths, source)
-            found[title].append(Photo(title, name, path, _given_mask(path)))
+            found[title].append(Photo(title, name, path, mask_of(path, masks)))
     return dict(found), failures
 
 
@@ -200,10 +202,29 @@ def _object_of(path: Path, beside: list[Path], source: Path) -> str:
     return str(folder) if folder.parts else source.resolve().name
 
 
-def _given_mask(path: Path) -> Path | None:
-    places = [f"{path.stem}_mask", *(f"{folder}/{path.stem}" for folder in _MASK_FOLDERS)]
-    candidates = (path.parent / f"{place}{ending}" for place in places for ending in PICTURE_SUFFIXES)
-    return next((each for each in candidates if each.is_file()), None)
+def is_mask(path: str | Path) -> bool:
+    """Whether a picture is by its name the mask of a photograph. The case of letters does not matter."""
+    path = Path(path)
+    return path.stem.lower().endswith(_MASK) or path.parent.name.lower() in _MASK_FOLDERS
+
+
+def masks_in(folder: str | Path) -> Masks:
+    """The masks of a folder's photographs, by the names of these as they are and in small letters, without suffix."""
+    folder = Path(folder)
+    folders = [each for each in folder.iterdir() if each.name.lower() in _MASK_FOLDERS and each.is_dir()]
+    found = {
+        path.stem[: -len(_MASK)] if path.stem.lower().endswith(_MASK) else path.stem: path
+        for each in (*folders, folder)  # a mask beside its photograph goes first
+        for path in sorted(each.iterdir())
+        if path.suffix.lower() in PICTURE_SUFFIXES and is_mask(path)
+    }
+    return {name.lower(): path for name, path in found.items()} | found
+
+
+def mask_of(path: str | Path, masks: Masks) -> Path | None:
+    """The mask of a photograph, among those of `masks_in` its folder."""
+    name = Path(path).stem
+    return masks.get(name) or masks.get(name.lower())
 
 
 class _Job(NamedTuple):

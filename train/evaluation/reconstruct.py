@@ -13,6 +13,7 @@ from diffpoint.io import write_points
 from train.data.cutout import cut_out
 from train.data.images import PICTURE_SUFFIXES, is_cut_out, read_images, read_rgba
 from train.data.layouts import pictures_of
+from train.data.photos import is_mask, mask_of, masks_in
 from train.device import CPU
 from train.errors import UserError
 from train.evaluation.explore import explore, not_explorable
@@ -128,6 +129,8 @@ def _object_files(images: Sequence[str | Path], *, command: str) -> list[Path]:
 def image_files(paths: Sequence[str | Path]) -> list[Path]:
     """The given image files; a folder is replaced by the images in it, a model of Choy's renderings by its views.
 
+    Of a folder, masks of photographs and hidden files, such as macOS writes beside each picture, are left out.
+
     Raises:
         UserError: a folder without images.
     """
@@ -137,7 +140,9 @@ def image_files(paths: Sequence[str | Path]) -> list[Path]:
             found.append(path)
             continue
         inside = pictures_of(path) or sorted(
-            p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES
+            each
+            for each in path.iterdir()
+            if each.suffix.lower() in PICTURE_SUFFIXES and each.name[0] != "." and not is_mask(each)
         )
         if not inside:
             raise UserError(
@@ -148,18 +153,25 @@ def image_files(paths: Sequence[str | Path]) -> list[Path]:
 
 
 def read_pictures(paths: Sequence[str | Path]) -> Tensor:
-    """(V, 3, 224, 224) in [0, 1]: objects on white; photographs with a plain background are cut out.
+    """(V, 3, 224, 224) in [0, 1]: objects on white; photographs with a mask or a plain background are cut out.
 
-    An image with transparency or a purely white border counts as cut out already; its scale is kept.
+    An image with transparency or a purely white border counts as cut out already; its scale is kept. A mask is a file
+    beside the photograph, as for `data photos`.
+
+    Raises:
+        UserError: not an image, or a mask that does not fit its photograph.
     """
     pictures = []
     for path in map(Path, paths):
         rgba = read_rgba(path)
         picture = read_images([path])
         if not is_cut_out(rgba):
+            mask = mask_of(path, masks_in(path.parent))
             try:
-                made = cut_out(rgba, size=picture.shape[-1])
+                made = cut_out(rgba, size=picture.shape[-1], given=mask and read_rgba(mask))
             except UserError as error:
+                if mask:
+                    raise UserError(f"{path}: {error}") from None
                 print(f"note: {path}: used whole: {error}", file=sys.stderr)
             else:
                 print(f"note: {path}: cut out: {made.found}", file=sys.stderr)

@@ -17,9 +17,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from train.config import FitConfig, changed_settings
-from train.data.cutout import cut_out
-from train.data.images import is_cut_out, read_rgba
-from train.data.photos import Photo, find_photos
+from train.data.photos import find_photos
 from train.errors import UserError
 from train.evaluation.inference import predict, reconstruct
 from train.evaluation.reconstruct import MOST_IMAGES, read_pictures
@@ -108,7 +106,7 @@ def read_objects(folder: Path | None) -> tuple[list[PhotographedObject], dict[st
         pictures = []
         for photo in shots[:MOST_IMAGES]:
             try:
-                pictures.append(_read(photo))
+                pictures.append(read_pictures([photo.path]))
             except UserError as error:
                 left_out[photo.title] = str(error)
         if len(shots) > MOST_IMAGES:
@@ -119,14 +117,6 @@ def read_objects(folder: Path | None) -> tuple[list[PhotographedObject], dict[st
         reasons = [f"{title}: {reason}" for title, reason in left_out.items()][:1]
         raise UserError("; ".join([f"no picture in {folder} can be used", *reasons, _USE]))
     return objects, left_out
-
-
-def _read(photo: Photo) -> Tensor:
-    """(1, 3, H, W) in [0, 1]."""
-    if photo.mask is None or is_cut_out(rgba := read_rgba(photo.path)):
-        return read_pictures([photo.path])
-    made = cut_out(rgba, given=read_rgba(photo.mask))
-    return torch.from_numpy(made.picture).permute(2, 0, 1)[None] / 255
 
 
 def _reconstruct(study: Study, network: Network, found: PhotographedObject) -> Metrics:
