@@ -243,7 +243,8 @@ def test_a_network_without_something_to_explore_says_so(
         ("explore {run} {tmp}/noise.png --out {tmp}/page.html", "noise.png is not an image"),
         ("explore {run} {tmp}/nothing.png --out {tmp}/page.html", "nothing.png does not exist"),
         ("explore {run} --out {tmp}/page.html", "explore takes 1 to 24 images; got 0"),
-        ("explore {run} {picture} --out {tmp}", "is a directory; --out names a file"),
+        ("explore {run} {picture} --out {tmp}", "is a directory where a file is to be written"),
+        ("explore {run} {picture} --out {tmp}/noise.png/a.html", "noise.png is a file, not a directory"),
         ("explore {tmp} {picture} --out {tmp}/page.html", "is not a run"),
     ],
 )

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from train.errors import UserError
+
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS})
 """Errors after which no other file can be written either: the disk is full or read-only."""
 
@@ -19,6 +21,24 @@ DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS})
 def as_paths(paths: str | Path | Sequence[str | Path]) -> list[Path]:
     """One path or several, as a list."""
     return [Path(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
+
+
+def require_writable(target: str | Path) -> None:
+    """Refuses a file that could not be written, before the hours of work that lead to it; makes nothing.
+
+    Raises:
+        UserError: it is a directory, or nothing may be written where its folder is or would be made.
+    """
+    target = Path(target)
+    if target.is_dir():
+        raise UserError(f"{target} is a directory where a file is to be written; choose another --out")
+    folder = next(each for each in target.absolute().parents if each.exists())
+    if not folder.is_dir():
+        raise UserError(f"{folder} is a file, not a directory; choose another --out")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise UserError(
+            f"nothing may be written to {folder}; choose another --out, or change its permissions"
+        )
 
 
 @contextmanager

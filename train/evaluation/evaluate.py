@@ -45,7 +45,7 @@ from train.evaluation.per_shape import (
 from train.evaluation.retrieval import medoid, nearest_by_image
 from train.evaluation.runs import open_run
 from train.evaluation.sensitivity import sensitivity
-from train.files import write_text
+from train.files import require_writable, write_text
 from train.processes import progress_bar
 from train.show.summary import format_result
 
@@ -86,7 +86,7 @@ def evaluate(
         What was written.
 
     Raises:
-        UserError: no such run or data, nothing to evaluate, or numbers out of range.
+        UserError: no such run or data, nothing to evaluate, numbers out of range, or a file that cannot be written.
     """
     begun = time.monotonic()
     _check(seeds, views, limit)
@@ -96,6 +96,7 @@ def evaluate(
         if folder is None:
             raise UserError(f"say where to write with --out FILE: {run} belongs to the repository")
         out = folder / "evaluation.json"
+    require_writable(out)
     test = opened.load_split(data, split, limit=limit, progress=progress)
     train = opened.load_split(data, "train", progress=progress)
     if framed:

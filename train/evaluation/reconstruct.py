@@ -19,7 +19,7 @@ from train.errors import UserError
 from train.evaluation.explore import explore, not_explorable
 from train.evaluation.inference import reconstruct
 from train.evaluation.runs import open_run
-from train.files import remove, replacing
+from train.files import remove, replacing, require_writable
 from train.show.explorer import write_explorer
 
 MOST_IMAGES = 24
@@ -49,14 +49,14 @@ def reconstruct_to_files(
         device: where the predictions are computed.
 
     Raises:
-        UserError: not a run, not an image, or a number out of range.
+        UserError: not a run, not an image, a number out of range, or a place that cannot be written.
     """
     from train.show.pages import write_reconstruction_page
 
     out = Path(out)
     images = _object_files(images, command="reconstruct")
-    if out.exists() and not out.is_dir():
-        raise UserError(f"{out} is a file; --out names a directory")
+    for file in ("reconstruction.ply", "reconstruction.html", "explore.html"):
+        require_writable(out / file)
     if (groups is not None and groups < 1) or (steps is not None and steps < 0):
         raise UserError(f"--groups must be at least 1 and --steps at least 0; got {groups} and {steps}")
     pictures = read_pictures(images)
@@ -99,12 +99,11 @@ def explore_to_file(
         device: where the predictions are computed.
 
     Raises:
-        UserError: not a run, one whose predictions do not depend on a code, not an image, or `out` is a directory.
+        UserError: not a run, one whose predictions do not depend on a code, not an image, or `out` cannot be written.
     """
     out = Path(out)
     images = _object_files(images, command="explore")
-    if out.is_dir():
-        raise UserError(f"{out} is a directory; --out names a file, for example {out / 'page.html'}")
+    require_writable(out)
     pictures = read_pictures(images)
     model, config, _ = open_run(run, device=device)
     obstacle = not_explorable(model)

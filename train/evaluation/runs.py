@@ -14,6 +14,7 @@ from train.config import FitConfig, fit_config_from_json
 from train.data.batches import LoadedSplit, load_split
 from train.device import CPU
 from train.errors import UserError
+from train.files import require_writable
 from train.methods.weights import method_of, predictor_classes, read_weights, save_weights
 
 PRETRAINED = "pretrained"
@@ -131,11 +132,12 @@ def export_weights(run: str | Path, out: str | Path, *, half: bool = False) -> N
         half: in float16: half the size. Coordinates change by about 0.0003 world units.
 
     Raises:
-        UserError: no such run, or a name that does not end in .safetensors.
+        UserError: no such run, a name that does not end in .safetensors, or a file that cannot be written.
     """
     out = Path(out)
-    if out.suffix != ".safetensors" or out.is_dir():
+    if out.suffix != ".safetensors":
         raise UserError(f"{out} is not the name of a weights file; --out must end in .safetensors")
+    require_writable(out)
     save_weights(load_predictor(run), out, half=half)
 
 

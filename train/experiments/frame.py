@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from train.config import FitConfig
 from train.experiments import store
 from train.experiments.study import Study, file_stem
-from train.files import write_text
+from train.files import require_writable, write_text
 from train.show import figures
 
 
@@ -54,7 +54,9 @@ def markdown_page(*blocks: str | Sequence[str]) -> str:
 def make_experiment(name: str, experiment: Experiment, study: Study) -> dict[str, Any]:
     """Makes an experiment and writes STEM.json, STEM.md and its figures into `study.out`, see `file_stem`; returns what
     STEM.json holds."""
-    outcome, stem = experiment.make(study), file_stem(name, study.recipe)
+    stem = file_stem(name, study.recipe)
+    require_writable(study.out / f"{stem}.json")
+    outcome = experiment.make(study)
     result = outcome.result | {"made_from": made_from(experiment, study)}
     for ending, figure in outcome.figures.items():
         figures.save(figure, study.out / f"{stem}{ending}.png")
