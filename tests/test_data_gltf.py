@@ -195,14 +195,32 @@ def test_texture_coordinates(
 
 def test_pictures_are_multiplied_by_factors_and_colours_of_vertices(tmp_path: Path) -> None:
     made = _Gltf()
-    made.paint(tmp_path, {}, baseColorFactor=[1, 0.2, 0, 1])
+    made.paint(tmp_path, {}, baseColorFactor=[1, 0.033105, 0, 1])  # 0.2 in sRGB
     made.primitive["attributes"]["TEXCOORD_0"] = made.add(np.full((8, 2), 0.75, "f4"), "VEC2")
     assert _seen(made.load(tmp_path)) == [1, 0.2, 0]
-    half = np.repeat(np.array([[32768, 65535, 0, 65535]], "u2"), 8, 0)
+    half = np.repeat(np.array([[14027, 65535, 0, 65535]], "u2"), 8, 0)  # 0.5 in sRGB
     made.primitive["attributes"]["COLOR_0"] = made.add(half, "VEC4", normalized=True)
     assert _seen(made.load(tmp_path)) == [0.5, 0.2, 0]
     del made.json["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
     assert _seen(made.load(tmp_path)) == [0.5, 0.2, 0]
+    del made.json["materials"], made.primitive["material"]
+    assert _seen(made.load(tmp_path)) == pytest.approx([0.5, 1, 0], abs=0.003)
+
+
+def test_colours_of_trimesh_are_those_of_pictures(tmp_path: Path) -> None:
+    made = _Gltf()
+    made.json["asset"]["generator"] = "https://github.com/mikedh/trimesh"
+    colours = np.repeat(np.array([[51, 255, 0, 255]], "u1"), 8, 0)
+    made.primitive["attributes"]["COLOR_0"] = made.add(colours, "VEC4", normalized=True)
+    assert _seen(made.load(tmp_path)) == [0.2, 1, 0]
+
+
+@pytest.mark.parametrize("material", [{}, {"pbrMetallicRoughness": {"metallicFactor": 0}}])
+def test_materials_without_a_colour_are_white(material: dict[str, Any], tmp_path: Path) -> None:
+    made = _Gltf()
+    made.json["materials"] = [material]
+    made.primitive["material"] = 0
+    assert _seen(made.load(tmp_path)) == [1, 1, 1]
 
 
 def test_colours_of_the_older_material_model(tmp_path: Path) -> None:

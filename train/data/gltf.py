@@ -1,8 +1,9 @@
-"""glTF files rewritten without what trimesh misreads: sparse accessors, fans, texture transforms, files without scenes.
+"""glTF files rewritten without what trimesh misreads.
 
 trimesh reads sparse accessors as zeros, takes the texture coordinates of the first set as they are (whatever set and
-transform the material names, and integers that stand for [0, 1]), leaves out fans, and ignores extensions that it does
-not know, also those that say where the geometry is.
+transform the material names, and integers that stand for [0, 1]), leaves out fans, needs a scene, and ignores
+extensions that it does not know, also those that say where the geometry is. Colours, which are linear in glTF, it takes
+for those of pictures, and materials without one for grey.
 """
 
 from __future__ import annotations
@@ -51,18 +52,23 @@ def plain(content: bytes, file_content: Callable[[str], bytes]) -> bytes:
         if not extension.startswith(_HARMLESS):
             raise ValueError(f"it needs the glTF extension {extension}, which is not read: save it without")
     document = _Document(scene, binary, file_content)
+    by_trimesh = "trimesh" in scene.get("asset", {}).get("generator", "")
     for accessor in scene.get("accessors", ()):
         if "sparse" in accessor:
             document.make_dense(accessor)
     for material in scene.get("materials", ()):
         _without_specular(material)
-        if "trimesh" in scene.get("asset", {}).get("generator", ""):
+        if by_trimesh:
             _without_default_grey(material)
+        colours = material.setdefault("pbrMetallicRoughness", {})
+        *colour, alpha = colours.get("baseColorFactor", (1, 1, 1, 1))
+        colours["baseColorFactor"] = [*(colour if by_trimesh else _as_seen(np.array(colour)).tolist()), alpha]
     for mesh in scene.get("meshes", ()):
         for primitive in mesh["primitives"]:
             if _DRACO not in primitive.get("extensions", {}):
                 document.unroll_fan(primitive)
                 document.transform_uv(primitive)
+                document.convert_colours(primitive, linear=not by_trimesh)
     if not scene.get("scenes"):
         nodes = scene.setdefault("nodes", [{"mesh": i} for i in range(len(scene.get("meshes", ())))])
         inner = {child for node in nodes for child in node.get("children", ())}
@@ -111,6 +117,12 @@ def _without_default_grey(material: dict[str, Any]) -> None:
     factor = colours.get("baseColorFactor")
     if "baseColorTexture" in colours and factor and np.allclose(factor[:3], 0.4, atol=0.002):
         del colours["baseColorFactor"]
+
+
+def _as_seen(linear: np.ndarray) -> np.ndarray:
+    """Linear colours in [0, 1] as pictures store them, in sRGB; trimesh writes its colours so in the first place."""
+    linear = linear.clip(0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 class _Document:
@@ -170,6 +182,13 @@ class _Document:
         start = accessor.get("byteOffset", 0)
         return self._rows(accessor["bufferView"], kind, accessor["count"], width, start)
 
+    def read_scaled(self, accessor: dict[str, Any]) -> np.ndarray:
+        """(count, width) float64, of integers that stand for [0, 1] or [-1, 1] those numbers."""
+        stored = self.read(accessor)
+        if not accessor.get("normalized") or stored.dtype.kind == "f":
+            return stored.astype(np.float64)
+        return np.maximum(stored / np.iinfo(stored.dtype).max, -1)
+
     def _write(self, values: np.ndarray) -> int:
         """The number of a new buffer view."""
         views = self.scene.setdefault("bufferViews", [])
@@ -222,10 +241,18 @@ class _Document:
         accessor = self.scene["accessors"][attributes[name]]
         if name == "TEXCOORD_0" and not change and accessor["componentType"] == 5126:
             return
-        stored = self.read(accessor)
-        uv = stored.astype(np.float64)
-        if accessor.get("normalized") and stored.dtype.kind in "iu":
-            uv = np.maximum(uv / np.iinfo(stored.dtype).max, -1)
+        uv = self.read_scaled(accessor)
         cos, sin = np.cos(change.get("rotation", 0)), np.sin(change.get("rotation", 0))
         turned = uv * change.get("scale", (1, 1)) @ np.array([[cos, -sin], [sin, cos]])
         attributes["TEXCOORD_0"] = self.add(turned + change.get("offset", (0, 0)), 5126, "VEC2")
+
+    def convert_colours(self, primitive: dict[str, Any], *, linear: bool) -> None:
+        """Makes the colours of vertices floats, as those of pictures."""
+        attributes = primitive["attributes"]
+        if "COLOR_0" in attributes:
+            accessor = self.scene["accessors"][attributes["COLOR_0"]] | {
+                "normalized": True
+            }  # not all files say so
+            colours = self.read_scaled(accessor)[:, :3]
+            colours = _as_seen(colours) if linear else colours
+            attributes["COLOR_0"] = self.add(colours, 5126, "VEC3")
