@@ -29,7 +29,7 @@ def _colour(surface: Surface) -> list[float]:
     """Of the first corner; of the texture, if it has one."""
     if surface.textures:
         return (surface.textures[0][0, 0] / 255).tolist()
-    return surface.corner_colours[0, 0].tolist()
+    return surface.corner_colours[0, 0].astype(float).round(3).tolist()
 
 
 @pytest.mark.parametrize(
@@ -87,6 +87,7 @@ def test_files_that_are_not_found_are_named(tmp_path: Path) -> None:
         ("COFF 4 4 0", "1.0 0.0 0.0 1.0", ""),
         ("OFF\n4 4 6", "", "255 0 0"),
         ("OFF\n4 4 6", "", "1.0 0.0 0.0 1.0"),
+        ("COFF\n4 4 0", "255.0 0.0 0.0 255.0", ""),
         ("OFF4 4 6", "", "255 0 0"),  # as in ModelNet
         ("NOFF\n4 4 6", "0 0 1", "255 0 0"),
         ("STCNOFF\n4 4 6", "0 0 1 255 0 0 255 0.5 0.5", ""),
@@ -97,6 +98,43 @@ def test_colours_of_off_files(head: str, of_vertex: str, of_face: str, tmp_path:
     faces = [f"3 {a} {b} {c} {of_face}" for a, b, c in _FACES]
     (tmp_path / "a.off").write_text("\n".join([head, "# a comment", *vertices, *faces, ""]))
     assert _colour(load_surface(tmp_path / "a.off")) == [1, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("red", "other"), [("1 0.2 0", "0 0 1"), ("255 51 0", "0 0 255"), ("1 0.2 0", "1 0.2 0.1")]
+)
+def test_colours_of_obj_vertices(red: str, other: str, tmp_path: Path) -> None:
+    # They go before the material's, as MeshLab writes one of grey for all.
+    (tmp_path / "a.mtl").write_text("newmtl grey\nKd 0.75 0.75 0.75\n")
+    vertices = [f"v {x:g} {y:g} {z:g} {red}" for x, y, z in _TETRAHEDRON]
+    faces = [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in _FACES]
+    (tmp_path / "a.obj").write_text(
+        "\n".join(["mtllib a.mtl", *vertices, f"v 9 9 9 {other}", "usemtl grey", *faces])
+    )
+    assert _colour(load_surface(tmp_path / "a.obj")) == [1, 0.2, 0]
+
+
+def test_obj_vertices_of_one_colour_do_not_hide_materials(tmp_path: Path) -> None:
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    vertices = [f"v {x:g} {y:g} {z:g} 1 1 1" for x, y, z in _TETRAHEDRON]
+    faces = [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in _FACES]
+    (tmp_path / "a.obj").write_text("\n".join(["mtllib a.mtl", *vertices, "usemtl red", *faces]))
+    assert _colour(load_surface(tmp_path / "a.obj")) == [1, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "red"), [("ushort", "65535 13107 0"), ("float", "255 51 0"), ("double", "1 0.2 0")]
+)
+@pytest.mark.parametrize("of_faces", [False, True])
+def test_colours_of_ply_files(kind: str, red: str, of_faces: bool, tmp_path: Path) -> None:
+    colours = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
+    header = "ply\nformat ascii 1.0\nelement vertex 4\n"
+    header += "".join(f"property float {name}\n" for name in "xyz") + ("" if of_faces else colours)
+    header += "element face 4\nproperty list uchar int vertex_indices\n" + (colours if of_faces else "")
+    vertices = [f"{x:g} {y:g} {z:g} {'' if of_faces else red}" for x, y, z in _TETRAHEDRON]
+    faces = [f"3 {a} {b} {c} {red if of_faces else ''}" for a, b, c in _FACES]
+    (tmp_path / "a.ply").write_text("\n".join([f"{header}end_header", *vertices, *faces, ""]))
+    assert _colour(load_surface(tmp_path / "a.ply")) == [1, 0.2, 0]
 
 
 def test_polygons_of_off_files(tmp_path: Path) -> None:

@@ -27,8 +27,9 @@ _VERTEX = re.compile(rb"^v +(\S+) +(\S+) +(\S+)", re.MULTILINE)
 
 def read_obj(content: bytes, files: Any) -> trimesh.Scene:
     """Reads an OBJ file in any encoding: only names and comments can have letters that are not ASCII."""
-    content, libraries = obj_text.plain(content)
-    return _load(_in_triangles(content), "obj", obj_text.Libraries(files, libraries))
+    content, names, is_coloured = obj_text.plain(content)
+    libraries = obj_text.Libraries(files, names, pictures_only=is_coloured)
+    return _load(_in_triangles(content), "obj", libraries)
 
 
 def _in_triangles(content: bytes) -> bytes:
@@ -101,8 +102,21 @@ def read_ply(content: bytes, files: Any) -> trimesh.Scene:
     scene = _load(header + end + body, "ply", files)
     for mesh in scene.geometry.values():
         if isinstance(mesh, trimesh.Trimesh):
+            _scale_colours(mesh)
             _cover_polygons(mesh)
     return scene
+
+
+def _scale_colours(mesh: trimesh.Trimesh) -> None:
+    """Reads again what trimesh takes for 8 bits or for [0, 1]: integers up to 65535, and floats up to 255."""
+    visual = mesh.visual
+    if not isinstance(visual, ColorVisuals) or visual.kind not in ("vertex", "face"):
+        return
+    columns = mesh.metadata["_ply_raw"][visual.kind]["data"]
+    values = np.column_stack([columns[name] for name in ("red", "green", "blue")])
+    top = 65535 if values.dtype.kind in "iu" else 255
+    if values.max() > (255 if top == 65535 else obj_text.BRIGHTEST):
+        mesh.visual = ColorVisuals(mesh, **{f"{visual.kind}_colors": values / top})
 
 
 def _cover_polygons(mesh: trimesh.Trimesh) -> None:
@@ -174,7 +188,9 @@ def read_off(content: bytes, files: Any) -> trimesh.Scene:
 def _colours(words: list[list[str]]) -> np.ndarray:
     """(N, 3) uint8 of integers up to 255, or of floats up to 1."""
     values = np.array([each[:3] for each in words], float)
-    is_float = any("." in word for each in words for word in each[:3])
+    is_float = values.max(initial=0) <= obj_text.BRIGHTEST and any(
+        "." in word for each in words for word in each[:3]
+    )
     return (255 * values if is_float else values).round().clip(0, 255).astype(np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""OBJ files as trimesh reads them: one kind of line ends and blanks, indices that count from the start, one library."""
+"""OBJ files as trimesh reads them: one kind of line ends and blanks, indices from 1, one library, colours up to 1."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from typing import Any
 LIBRARY = "materials of all libraries.mtl"
 
 _KEYWORDS = (b"v ", b"vt ", b"vn ")
+_COLOURED = re.compile(rb"(?m)^(v(?: +\S+){3})((?: +\S+){3}) *$")
+
+BRIGHTEST = 2
+"""Floats up to this are colours in [0, 1], give or take some light; larger ones are in [0, 255]."""
 
 
 def as_text(content: bytes) -> bytes:
@@ -21,8 +25,9 @@ def as_text(content: bytes) -> bytes:
     return content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\0", b"")
 
 
-def plain(content: bytes) -> tuple[bytes, list[str]]:
-    """An OBJ file, and the names of its material libraries, for which it names `LIBRARY`."""
+def plain(content: bytes) -> tuple[bytes, list[str], bool]:
+    """An OBJ file, the names of its material libraries, for which it names `LIBRARY`, and whether its vertices have
+    colours of their own, more than one."""
     content = re.sub(rb"\\[ \t]*\n", b" ", as_text(content)).replace(b"\t", b" ")
     if re.search(rb"(?m)^ +", content):
         content = re.sub(rb"(?m)^ +", b"", content)
@@ -30,12 +35,27 @@ def plain(content: bytes) -> tuple[bytes, list[str]]:
         content = re.sub(rb"(?m)^((?:v|vt|vn|f) [^#\n]*)#.*$", rb"\1", content)
     if re.search(rb"(?m)^f .*-", content):
         content = b"\n".join(_from_the_start(content))
+    content, is_coloured = _in_small_colours(content)
     named = [line.decode() for line in re.findall(rb"(?m)^mtllib +(.*?) *$", content)]
     if not named:
-        return content, []
+        return content, [], is_coloured
     content = re.sub(rb"(?m)^mtllib .*$", b"", content)
     libraries = [name for line in named for name in re.findall(r"\S.*?\.mtl(?= |$)", line, re.I) or [line]]
-    return f"mtllib {LIBRARY}\n".encode() + content, libraries
+    return f"mtllib {LIBRARY}\n".encode() + content, libraries, is_coloured
+
+
+def _in_small_colours(content: bytes) -> tuple[bytes, bool]:
+    """The same with colours of vertices in [0, 1], and whether these differ."""
+    first = re.search(rb"(?m)^v .*$", content)
+    if first is None or not _COLOURED.fullmatch(first[0]):
+        return content, False
+    colours = {words for _, words in _COLOURED.findall(content)}
+    if max(float(word) for words in colours for word in words.split()) > BRIGHTEST:
+        small = {
+            words: b"".join(b" %.4f" % (float(word) / 255) for word in words.split()) for words in colours
+        }
+        content = _COLOURED.sub(lambda match: match[1] + small[match[2]], content)
+    return content, len(colours) > 1
 
 
 def _from_the_start(content: bytes) -> Iterator[bytes]:
@@ -57,10 +77,13 @@ def _from_the_start(content: bytes) -> Iterator[bytes]:
 
 
 class Libraries:
-    """The files that a mesh names; `LIBRARY` holds all of its material libraries that exist."""
+    """The files that a mesh names; `LIBRARY` holds all of its material libraries that exist.
 
-    def __init__(self, files: Any, names: list[str]) -> None:
-        self._files, self._names = files, names
+    With `pictures_only` it holds the materials that have a picture: the others would hide the colours of vertices.
+    """
+
+    def __init__(self, files: Any, names: list[str], *, pictures_only: bool) -> None:
+        self._files, self._names, self._pictures_only = files, names, pictures_only
 
     def get(self, name: str) -> bytes:
         if name != LIBRARY:
@@ -71,6 +94,7 @@ class Libraries:
                 found.append(self._files.get(each))
             except FileNotFoundError:  # `files` counts it
                 continue
-        return b"\n".join(found)
+        materials = re.split(rb"(?m)^(?=newmtl )", b"\n".join(found))
+        return b"".join(each for each in materials if not self._pictures_only or b"map_kd " in each.lower())
 
     __getitem__ = get
