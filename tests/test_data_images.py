@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from train.data import images
 from train.data.images import decode, is_cut_out, read_images, read_rgba
@@ -59,6 +59,47 @@ def test_floats_are_taken_from_0_to_1(tmp_path: Path) -> None:
         UserError, match=r"floats from 10 to .* should be between 0 and 1: save it with 8 bits"
     ):
         read_rgba(tmp_path / "bad.tif")
+
+
+def test_values_of_fewer_bits_than_the_file_has_are_refused_with_the_remedy(tmp_path: Path) -> None:
+    values = np.asarray(_picture("L"), np.uint16)
+    Image.fromarray(257 * values).save(tmp_path / "a.png")
+    assert read_images([tmp_path / "a.png"]).min() < 0.05
+    for factor in (1, 16):
+        Image.fromarray(factor * values[:48, :48]).save(tmp_path / "a.png")
+        with pytest.raises(UserError, match=r"black everywhere; a file of 16 bits .* saved with 8 bits"):
+            read_images([tmp_path / "a.png"])
+
+
+def _swapped_profile() -> bytes:
+    """sRGB with red and green exchanged, under another name."""
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for old, new in ((b"rXYZ", b"_XYZ"), (b"gXYZ", b"rXYZ"), (b"_XYZ", b"gXYZ"), (b"\0s\0R", b"\0t\0R")):
+        profile = profile.replace(old, new, 1)
+    return profile
+
+
+@pytest.mark.parametrize(
+    ("mode", "suffix"), [("RGB", "jpg"), ("RGB", "png"), ("RGBA", "png"), ("RGB", "webp")]
+)
+def test_colours_are_those_of_the_profile(mode: str, suffix: str, tmp_path: Path) -> None:
+    Image.new(mode, (32, 32), "red").save(tmp_path / f"a.{suffix}", icc_profile=_swapped_profile())
+    assert read_rgba(tmp_path / f"a.{suffix}")[16, 16] == pytest.approx([0, 1, 0, 1], abs=0.02)
+
+
+def test_transparency_stays_where_colours_are_converted(tmp_path: Path) -> None:
+    clear = Image.new("RGBA", (32, 32), (255, 0, 0, 51))
+    clear.save(tmp_path / "clear.png", icc_profile=_swapped_profile())
+    key = Image.new("RGB", (32, 32), "red")
+    key.save(tmp_path / "key.png", icc_profile=_swapped_profile(), transparency=(255, 0, 0))
+    for name, alpha in (("clear", 0.2), ("key", 0)):
+        assert read_rgba(tmp_path / f"{name}.png")[16, 16, 3] == pytest.approx(alpha)
+
+
+def test_a_broken_profile_is_left_out(tmp_path: Path) -> None:
+    for mode, profile in (("RGB", b"none"), ("L", _swapped_profile())):
+        Image.new(mode, (32, 32), "white").save(tmp_path / "a.png", icc_profile=profile)
+        assert read_rgba(tmp_path / "a.png").min() == 1
 
 
 @pytest.mark.parametrize("suffix", [".heic", ".AVIF", ".nef"])

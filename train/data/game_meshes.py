@@ -13,6 +13,7 @@ from PIL import Image
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import SimpleMaterial
 
+from train.data.images import eight_bits
 from train.data.polygons import triangulate
 
 FileContent = Callable[[str], bytes]
@@ -263,7 +264,7 @@ def _image(name: str, file_content: FileContent) -> Image.Image | None:
         names = [f"{name[1:]}{suffix}" for suffix in _IMAGE_SUFFIXES]
     for candidate in names:
         try:
-            return Image.open(io.BytesIO(file_content(candidate))).convert("RGBA")
+            return eight_bits(Image.open(io.BytesIO(file_content(candidate)))).convert("RGBA")
         except (OSError, ValueError, SyntaxError):
             continue
     return None

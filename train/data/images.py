@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps
+from PIL import Image, ImageCms, ImageOps
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -25,6 +26,7 @@ _ENOUGH = 50_000_000
 """Pictures with more pixels are read at a reduced size."""
 _WHITE = 0.985
 _BLANK = 0.97
+_BLACK = 1 / 16  # the brightest value of 12 bits in 16
 
 
 def decode(path: str | Path) -> np.ndarray:
@@ -40,11 +42,35 @@ def decode(path: str | Path) -> np.ndarray:
         if image.mode.startswith("I"):  # 16 bits of grey; older versions of Pillow widen them to 32
             return np.asarray(image).clip(0, 65535).astype(np.uint16)[..., None]
         one_clear_colour = "transparency" in image.info
-        if one_clear_colour or image.mode not in ("L", "LA", "RGB", "RGBA", "F"):
+        if one_clear_colour or image.mode not in ("L", "LA", "RGB", "RGBA", "F", "CMYK"):
             image = image.convert("RGBA")
         if image.width * image.height > _ENOUGH:
             image = image.reduce(math.ceil(math.sqrt(image.width * image.height / _ENOUGH)))
-        return np.atleast_3d(np.asarray(image))
+        image = _in_srgb(image)
+        return np.atleast_3d(np.asarray(image.convert("RGBA") if image.mode == "CMYK" else image))
+
+
+def _in_srgb(image: Image.Image) -> Image.Image:
+    """Converts the colours of a picture with a profile, as telephones and printers' programs write them."""
+    profile = image.info.get("icc_profile")
+    if not profile or image.mode not in ("L", "RGB", "RGBA", "CMYK"):
+        return image
+    try:
+        own = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        if "sRGB" in ImageCms.getProfileDescription(own):
+            return image
+        mode = "RGBA" if image.mode == "RGBA" else "RGB"
+        converted = ImageCms.profileToProfile(image, own, ImageCms.createProfile("sRGB"), outputMode=mode)
+        return converted or image
+    except (ImageCms.PyCMSError, OSError):  # a broken profile, or one of another colour model: as browsers do
+        return image
+
+
+def eight_bits(image: Image.Image) -> Image.Image:
+    """Grey of 16 bits as 8; Pillow's own conversion takes all that is brighter than 255 for white."""
+    if not image.mode.startswith("I"):
+        return image
+    return Image.fromarray((np.asarray(image).clip(0, 65535) >> 8).astype(np.uint8))
 
 
 @contextmanager
@@ -88,6 +114,9 @@ def read_images(paths: Sequence[str | Path], *, size: int = 224) -> Tensor:
         picture = on_white(_decode_object(path))
         if picture.min() > _BLANK:
             raise UserError(f"{path} shows nothing: it is white or transparent everywhere")
+        if picture.max() < _BLACK:
+            hint = "a file of 16 bits whose values have fewer is to be saved with 8 bits"
+            raise UserError(f"{path} shows nothing: it is black everywhere; {hint}")
         height, width = picture.shape[1:]
         side = max(height, width)
         left, top = (side - width) // 2, (side - height) // 2

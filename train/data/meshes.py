@@ -22,6 +22,7 @@ from trimesh.visual.material import PBRMaterial
 from diffpoint.camera import PinholeCamera
 from train.data import game_meshes, mesh_text, tree_files
 from train.data.categories import category_of
+from train.data.images import eight_bits
 from train.data.mesh_sources import (
     UPRIGHT,
     MeshFile,
@@ -508,7 +509,7 @@ def _transparency(material: object) -> tuple[str, float]:
 
 def _texture(image: Image.Image, alpha_mode: str, cutoff: float) -> np.ndarray:
     """RGB (h, w, 3) uint8, transparency on white."""
-    image = image.convert("RGBA")
+    image = eight_bits(image).convert("RGBA")
     if alpha_mode == "OPAQUE":
         image.putalpha(255)
     elif alpha_mode == "MASK":
