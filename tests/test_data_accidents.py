@@ -12,6 +12,7 @@ import time
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from trees import all_shapes, files_of
 
 from train.__main__ import main
@@ -97,6 +98,26 @@ def test_a_full_disk_stops_the_run_with_one_line(boxes, tmp_path, capsys, proces
     assert not list(out.glob(f"{tree_files.RENDERS}/*/*"))  # nothing half-written, not even hidden
     if processes == 1:
         assert convert(boxes, out, processes=1, **SETTINGS).made == BOXES
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere all names of files are Unicode")
+def test_names_of_files_that_are_not_utf8(tmp_path, capsys):
+    source = os.fsencode(tmp_path / "in")
+    os.mkdir(source)
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.ply")
+    os.rename(tmp_path / "box.ply", source + b"/St\xfchle.ply")
+    with open(source + b"/Caf\xe9.ply", "w"):
+        pass
+    Image.fromarray(np.pad(np.full((20, 20), 60, np.uint8), 20, constant_values=250)).save(tmp_path / "a.png")
+    os.rename(tmp_path / "a.png", source + b"/Caf\xe9.png")
+    meshes, photos = tmp_path / "meshes", tmp_path / "photos"
+    assert main(["data", "meshes", str(tmp_path / "in"), "--out", str(meshes), "--size", "32"]) == 0
+    assert main(["data", "photos", str(tmp_path / "in"), "--out", str(photos)]) == 0
+    said = capsys.readouterr().out
+    assert "made 1 shapes" in said
+    assert "in/Caf\\udce9.png: plain background" in said
+    assert b"Caf\xe9.ply" in (meshes / "left_out.csv").read_bytes()
+    assert b"Caf\xe9.png" in (photos / "photos.json").read_bytes()
 
 
 def save_ball(path, side):

@@ -9,6 +9,7 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import dataclasses
+import io
 import itertools
 import os
 import sys
@@ -331,6 +332,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Daemons close their outputs, for which Python has None; libraries ask it whether it is a terminal.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
+    if isinstance(
+        sys.stdout, io.TextIOWrapper
+    ):  # as stderr is: a name of a file may have letters it cannot print
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:
             command = _parse(renamed_options(sys.argv[1:] if arguments is None else arguments))

@@ -58,9 +58,9 @@ def replacing(target: str | Path) -> Iterator[Path]:
 
 
 def write_text(target: str | Path, text: str) -> None:
-    """Writes a text file atomically."""
+    """Writes a text file atomically; names of files that are no UTF-8 keep their bytes."""
     with replacing(target) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, encoding="utf-8", errors="surrogateescape")
 
 
 def kept(path: str | Path, key: Any, make: Callable[[], Any]) -> Any:

@@ -306,7 +306,8 @@ def shape_ids(meshes: Sequence[MeshFile]) -> list[str]:
     hashes: Counter[str] = Counter()
     for mesh, (name, exact) in zip(meshes, plain, strict=True):
         if not exact or uses[f"{mesh.synset}/{name.lower()}"] > 1:
-            name = f"{name}-{hashlib.sha256(mesh.name.encode()).hexdigest()[:8]}"
+            whole = mesh.name.encode(errors="surrogateescape")  # a name need not be UTF-8
+            name = f"{name}-{hashlib.sha256(whole).hexdigest()[:8]}"
             hashes[name] += 1
             if hashes[name] > 1:  # libraries of one name
                 name = f"{name}-{hashes[name]}"

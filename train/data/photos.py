@@ -139,7 +139,8 @@ def convert_photos(
     for leftover in list(out.glob("**/.*.tmp")):
         leftover.unlink(missing_ok=True)
     try:
-        earlier = dict(json.loads((out / _RECORD).read_text())).get("found", {})
+        record = (out / _RECORD).read_text(encoding="utf-8", errors="surrogateescape")
+        earlier = dict(json.loads(record)).get("found", {})
     except (OSError, ValueError):
         earlier = {}
     jobs = [_Job(photo, out / photo.target, size) for photo in chosen if not (out / photo.target).is_file()]
