@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +15,8 @@ from torch import Tensor
 from diffpoint import _checks
 
 _EMPTY = 65535  # the code of empty pixels
+_WRITABLE = (".ply", ".xyz", ".obj", ".glb")
+"""Suffixes of the formats of trimesh that hold points without faces; of others it writes empty files, or fails."""
 
 
 def encode_depth(depth: Tensor, *, max_depth: float = 10.0) -> np.ndarray:
@@ -25,7 +28,7 @@ def encode_depth(depth: Tensor, *, max_depth: float = 10.0) -> np.ndarray:
     """
     max_depth = _check_max_depth("encode_depth", max_depth)
     code = (depth.detach().double() * (_EMPTY / max_depth)).round().clamp(0, _EMPTY - 1)
-    return torch.where(torch.isfinite(depth), code, _EMPTY).numpy().astype(np.uint16)
+    return torch.where(torch.isfinite(depth), code, _EMPTY).cpu().numpy().astype(np.uint16)
 
 
 def decode_depth(code: np.ndarray, *, max_depth: float = 10.0) -> Tensor:
@@ -80,17 +83,22 @@ def _check_max_depth(function: str, max_depth: float) -> float:
 
 
 def write_points(path: str | os.PathLike[str], points: Tensor) -> None:
-    """Write a cloud (N, 3) as .ply (or another point format of trimesh); the file appears whole or not at all.
+    """Write a cloud (N, 3) as .ply, .xyz, .obj or .glb; the file appears whole or not at all.
 
     Raises:
-        ValueError: not one cloud, or coordinates that are not finite.
+        ValueError: not one cloud, no points, coordinates that are not finite, or another suffix.
         ImportError: trimesh is not installed.
     """
     _checks.check_tensor("write_points", "points", points, ("N", 3))
     _checks.check_finite("write_points", "points", points.detach())
+    if len(points) == 0:
+        raise _checks.fail("write_points", "points", "hold at least one point", "none")
     path = Path(path)
-    cloud = _trimesh().PointCloud(points.detach().to(torch.float32).numpy())
-    content = cloud.export(file_type=path.suffix.lstrip(".") or "ply")
+    suffix = path.suffix.lower() or ".ply"
+    if suffix not in _WRITABLE:
+        raise _checks.fail("write_points", "path", f"end in one of {', '.join(_WRITABLE)}", repr(path.suffix))
+    cloud = _trimesh().PointCloud(points.detach().to("cpu", torch.float32).numpy())
+    content = cloud.export(file_type=suffix[1:])
     _replace(
         path, lambda file: file.write_bytes(content if isinstance(content, bytes) else str(content).encode())
     )
@@ -106,7 +114,10 @@ def read_points(path: str | os.PathLike[str]) -> Tensor:
     if not Path(path).is_file():
         raise FileNotFoundError(f"read_points: {path} does not exist.")
     try:
-        loaded = _trimesh().load(path, process=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of texture coordinates, where a vertex has none
+            # Of an OBJ file trimesh would leave out some vertices and double others, in an order of its own.
+            loaded = _trimesh().load(path, process=False, maintain_order=True)
         vertices = loaded.to_geometry().vertices if hasattr(loaded, "to_geometry") else loaded.vertices
     except Exception as error:  # every format has its own exceptions; all mean that the file is not a cloud
         raise _checks.fail("read_points", "path", "name a point cloud", f"{path}: {error}") from None

@@ -122,6 +122,7 @@ def _note_wait() -> None:
 # --- what is computed on both devices
 
 import diffpoint  # noqa: E402
+from diffpoint import io  # noqa: E402
 from models import build_generator  # noqa: E402
 from train.config import FitConfig, with_steps  # noqa: E402
 from train.data.batches import LoadedSplit, load_split  # noqa: E402
@@ -386,6 +387,16 @@ def tf32(data: Path, run: Path) -> None:
     model.tf32 = False
     model(images, codes)
     assert seen == [(False, False)] * 4
+
+
+@check
+def files(data: Path, run: Path) -> None:
+    points, depth = torch.rand(5, 3), torch.rand(4, 6)
+    with tempfile.TemporaryDirectory() as folder:
+        io.write_points(Path(folder, "a.ply"), points.to(SECOND))
+        close(io.read_points(Path(folder, "a.ply")), points)
+        io.write_depth(Path(folder, "a.png"), depth.to(SECOND))
+        close(io.read_depth(Path(folder, "a.png")), depth, tolerance=1e-4)
 
 
 def main(data: Path, run: Path, *names: str) -> None:

@@ -30,6 +30,7 @@ _CHECKS = (
     "latent_head_and_horizon", "all_methods", "a_step_waits_for_nothing_but_the_layer",
     "a_loss_that_is_not_finite_ends_the_training_before_anything_is_kept",
     "a_run_begun_on_one_device_goes_on_on_another", "inference", "evaluation", "validation", "tf32",
+    "files",
 )  # fmt: skip
 
 

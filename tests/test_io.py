@@ -33,6 +33,35 @@ def test_clouds_come_back_to_the_last_bit(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["cloud.ply"]
 
 
+@pytest.mark.parametrize("suffix", ["ply", "PLY", "xyz", "obj", "glb"])
+def test_formats_of_points(suffix, tmp_path):
+    points = torch.randn(30, 3, generator=torch.Generator().manual_seed(0))
+    io.write_points(tmp_path / f"cloud.{suffix}", points)
+    assert torch.allclose(io.read_points(tmp_path / f"cloud.{suffix}"), points, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "off", "gltf", "csv"])
+def test_formats_without_points_are_refused(suffix, tmp_path):
+    with pytest.raises(ValueError, match=r"write_points: 'path' must end in one of \.ply, \.xyz"):
+        io.write_points(tmp_path / f"cloud.{suffix}", torch.zeros(2, 3))
+    with pytest.raises(ValueError, match="'points' must hold at least one point"):
+        io.write_points(tmp_path / "cloud.ply", torch.zeros(0, 3))
+    assert not list(tmp_path.iterdir())
+
+
+def test_vertices_of_obj_files_are_those_of_the_file(tmp_path):
+    corners = [
+        [0, 0, 0],
+        [1, 0, 0],
+        [9, 9, 9],
+        [1, 1, 0],
+        [0, 1, 0],
+    ]  # one is in no face, two have two textures
+    lines = [*(f"v {x} {y} {z}" for x, y, z in corners), "vt 0 0", "vt 1 1", "f 5/1 1/1 2/1", "f 1/2 2/2 4/2"]
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    assert io.read_points(tmp_path / "a.obj").tolist() == corners
+
+
 def test_what_is_no_cloud_and_no_map_is_refused(tmp_path):
     text = tmp_path / "text.ply"
     text.write_text("nothing of the kind")
