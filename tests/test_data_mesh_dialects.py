@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from train.data.meshes import MeshError, load_surface
+from train.data.meshes import MeshError, convert, load_surface
+from train.errors import UserError
 
 _CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 2) for z in (0, 3)], float)
 _QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -151,6 +152,7 @@ def test_stl_dialects(content: bytes, tmp_path: Path) -> None:
         ("a.stl", b"", "holds 0"),
         ("a.off", b"", "does not start with OFF"),
         ("a.off", b"OFF BINARY\n" + bytes(12), "save it as text"),
+        ("a.obj", _VERTICES.encode() + b"f 1 2 3\nf 2/1 3/1 0/1\n", "count from 1"),
         ("a.obj", _VERTICES.encode(), "no faces: points and lines"),
         ("a.obj", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
     ],
@@ -159,3 +161,9 @@ def test_files_that_are_not_whole_meshes_say_so(name: str, content: bytes, said:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(MeshError, match=said):
         load_surface(tmp_path / name)
+
+
+def test_a_source_without_meshes_says_what_was_looked_for(tmp_path: Path) -> None:
+    (tmp_path / "a.fbx").write_bytes(b"")
+    with pytest.raises(UserError, match=r"no meshes in .*; looked for \.obj, \.glb"):
+        convert(tmp_path, tmp_path / "out")

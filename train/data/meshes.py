@@ -24,6 +24,7 @@ from train.data import game_meshes, mesh_text, tree_files
 from train.data.categories import category_of
 from train.data.images import eight_bits
 from train.data.mesh_sources import (
+    MESH_SUFFIXES,
     UPRIGHT,
     MeshFile,
     find_meshes,
@@ -191,7 +192,8 @@ def convert(
     with tempfile.TemporaryDirectory(prefix="meshes-") as scratch:
         meshes, failures = find_meshes(sources, scratch, up=options.up)
         if not meshes:
-            raise UserError(f"no meshes in {', '.join(map(str, sources)) or 'no sources'}")
+            named = ", ".join(map(str, sources)) or "no sources"
+            raise UserError(f"no meshes in {named}; looked for {', '.join(MESH_SUFFIXES)}")
         if wanted is not None and labels is not None:
             meshes, absent = keep_labelled(meshes, wanted, labels, others=unlabelled)
             failures |= absent

@@ -27,7 +27,11 @@ def as_text(content: bytes) -> bytes:
 
 def plain(content: bytes) -> tuple[bytes, list[str], bool]:
     """An OBJ file, the names of its material libraries, for which it names `LIBRARY`, and whether its vertices have
-    colours of their own, more than one."""
+    colours of their own, more than one.
+
+    Raises:
+        ValueError: a face with the vertex 0.
+    """
     content = re.sub(rb"\\[ \t]*\n", b" ", as_text(content)).replace(b"\t", b" ")
     if re.search(rb"(?m)^ +", content):
         content = re.sub(rb"(?m)^ +", b"", content)
@@ -35,6 +39,8 @@ def plain(content: bytes) -> tuple[bytes, list[str], bool]:
         content = re.sub(rb"(?m)^((?:v|vt|vn|f) [^#\n]*)#.*$", rb"\1", content)
     if re.search(rb"(?m)^f .*-", content):
         content = b"\n".join(_from_the_start(content))
+    if re.search(rb"(?m)^f(?: .*)? 0+(?=[/ ]|$)", content):  # trimesh takes it for the last vertex
+        raise ValueError("a face with the vertex 0: OBJ files count from 1")
     content, is_coloured = _in_small_colours(content)
     named = [line.decode() for line in re.findall(rb"(?m)^mtllib +(.*?) *$", content)]
     if not named:
