@@ -118,6 +118,44 @@ def test_triangle_fans(tmp_path: Path) -> None:
     assert _sides(surface) == pytest.approx(_SIDES)
 
 
+def _with_bones(made: _Gltf) -> None:
+    """One bone holds the lower half of the box, another the upper half, which it moves up by 1."""
+    upper = (_BOX.vertices[:, 1] > 0).astype("u1")
+    joints = np.zeros((8, 4), "u1")
+    joints[:, 0] = upper
+    shares = np.tile(np.array([255, 0, 0, 0], "u1"), (8, 1))
+    made.primitive["attributes"] |= {
+        "JOINTS_0": made.add(joints, "VEC4"),
+        "WEIGHTS_0": made.add(shares, "VEC4", normalized=True),
+    }
+    binding = np.tile(np.eye(4, dtype="f4"), (2, 1, 1))
+    binding[:, 3, 1] = (0, 3)  # by columns: the second bone was at y = -3
+    made.json["skins"] = [{"joints": [1, 2], "inverseBindMatrices": made.add(binding.reshape(2, 16), "MAT4")}]
+    made.json["nodes"] = [
+        {"mesh": 0, "skin": 0, "scale": [9, 1, 1]},  # does not count
+        {"children": [2], "rotation": [0, 0, 0, 0]},
+        {"translation": [0, -2, 0]},
+    ]
+    made.json["scenes"] = [{"nodes": [0, 1]}]
+
+
+def test_meshes_are_posed_by_their_bones(tmp_path: Path) -> None:
+    made = _Gltf()
+    _with_bones(made)
+    assert _sides(made.load(tmp_path)) == pytest.approx(np.array([1, 3, 3]) / np.sqrt(19), abs=1e-6)
+
+
+def test_meshes_have_the_shape_of_their_weights(tmp_path: Path) -> None:
+    made = _Gltf()
+    wider = np.asarray(_BOX.vertices * (4, 0, 0), "f4")
+    made.primitive["targets"] = [{"POSITION": made.add(wider, "VEC3")}]
+    for of_mesh, of_node, width in ((0.5, None, 3), (0.5, 1.0, 5), (0.0, None, 1)):
+        made.json["meshes"][0]["weights"] = [of_mesh]
+        made.json["nodes"] = [{"mesh": 0} if of_node is None else {"mesh": 0, "weights": [of_node]}]
+        sides = np.array([width, 2, 3])
+        assert _sides(made.load(tmp_path)) == pytest.approx(sides / np.linalg.norm(sides), abs=1e-6)
+
+
 def test_files_without_scenes(tmp_path: Path) -> None:
     made = _Gltf(_BOX.vertices / [1, 2, 3])
     del made.json["scenes"], made.json["scene"]

@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from train.data.gltf_pose import pose
+
 _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
@@ -74,6 +76,7 @@ def plain(content: bytes, file_content: Callable[[str], bytes]) -> bytes:
         inner = {child for node in nodes for child in node.get("children", ())}
         scene["scenes"] = [{"nodes": [i for i in range(len(nodes)) if i not in inner]}]
         scene["scene"] = 0
+    pose(document)
     return document.as_glb()
 
 
