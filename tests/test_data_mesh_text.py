@@ -65,6 +65,16 @@ def test_a_texture_with_spaces_in_its_name(tmp_path: Path) -> None:
     assert _colour(load_surface(tmp_path / "m.obj")) == [1, 0, 0]
 
 
+@pytest.mark.parametrize("name", ["broken.png", "sky.exr"])
+def test_pictures_that_cannot_be_read_are_named(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("<html>not found")
+    (tmp_path / "m.mtl").write_text(f"newmtl a\nKd 1 0 0\nmap_Kd {name}\n")
+    (tmp_path / "a.obj").write_text(_TEXTURED)
+    surface = load_surface(tmp_path / "a.obj")
+    assert surface.missing_files == (name,)
+    assert _colour(surface) == [1, 0, 0]
+
+
 def test_grey_textures_of_16_bits(tmp_path: Path) -> None:
     Image.fromarray(np.full((8, 8), 51 << 8, np.uint16)).save(tmp_path / "grey.png")
     (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd grey.png\n")

@@ -49,6 +49,8 @@ _TEXTURE_SIZE = 512
 _LARGEST_FILE = 256 << 20
 """Bytes: about ten million faces, which take 5 GB of memory to read. A mesh of three million takes 1.7 GB."""
 
+_UNREAD_PICTURES = (".exr", ".hdr", ".ktx", ".ktx2", ".svg")
+
 _LFS = b"version https://git-lfs"
 
 _MAX_STRETCH = 0.3  # natural logarithm of the factor along an axis
@@ -105,7 +107,7 @@ class MeshReport:
         made, kept, others: its shapes that this run and an earlier one have made of these sources, and all others.
         counts, categories: its shapes by split and by category.
         failures: reasons by the name of the mesh.
-        missing_files: textures and other files that were not found, by the name of the mesh that names them.
+        missing_files: textures and other files that were not found or cannot be read, by the mesh that names them.
     """
 
     out: Path
@@ -397,7 +399,7 @@ class _Files(FilePathResolver):
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Names that were not found, under no suffix that was tried."""
+        """Names that were not found, under no suffix that was tried, and pictures that cannot be read."""
         found = {Path(name).stem for name, exists in self._asked.items() if exists}
         return tuple(
             name for name, exists in self._asked.items() if not exists and Path(name).stem not in found
@@ -406,7 +408,7 @@ class _Files(FilePathResolver):
     def get(self, name: str) -> bytes:
         name = name.strip().replace("\\", "/")
         content = self._read(name)
-        self._asked[name] = content is not None
+        self._asked[name] = content is not None and _is_usable(name, content)
         if content is None:
             raise FileNotFoundError(name)
         return mesh_text.clean_mtl(content) if name.lower().endswith(".mtl") else content
@@ -428,6 +430,18 @@ class _Files(FilePathResolver):
             if path.is_relative_to(self._root) and path.is_file():
                 return path.read_bytes()
         return None
+
+
+def _is_usable(name: str, content: bytes) -> bool:
+    """False for a broken picture, or one in a format that is not read: readers of meshes leave it out silently."""
+    suffix = Path(name).suffix.lower()
+    if suffix not in Image.registered_extensions():
+        return suffix not in _UNREAD_PICTURES
+    try:
+        Image.open(io.BytesIO(content)).close()
+    except Exception:  # every decoder has its own exceptions
+        return False
+    return True
 
 
 def _in_any_case(path: Path) -> Path | None:

@@ -18,7 +18,7 @@ class Surface:
         face_texture: (F,) int, index into `textures`, or -1 for none.
         corner_uv: (F, 3, 2) float32, v up; read where `face_texture` >= 0.
         textures: images (h, w, 3) uint8.
-        missing_files: names of files that the mesh's file names and that were not found.
+        missing_files: names of files that the mesh's file names and that were not found or cannot be read.
     """
 
     vertices: np.ndarray
