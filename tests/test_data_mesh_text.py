@@ -129,6 +129,15 @@ def test_colours_of_obj_vertices(red: str, other: str, tmp_path: Path) -> None:
     assert _colour(load_surface(tmp_path / "a.obj")) == [1, 0.2, 0]
 
 
+def test_texture_coordinates_without_a_picture_do_not_hide_colours_of_obj_vertices(tmp_path: Path) -> None:
+    lines = _TEXTURED.splitlines()[1:]  # no library
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    assert _colour(load_surface(tmp_path / "a.obj")) == [0.7, 0.7, 0.7]  # as without texture coordinates
+    lines = [f"{line} 1 0.2 0" if line.startswith("v ") else line for line in lines]
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    assert _colour(load_surface(tmp_path / "a.obj")) == [1, 0.2, 0]
+
+
 def test_obj_vertices_of_one_colour_do_not_hide_materials(tmp_path: Path) -> None:
     (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
     vertices = [f"v {x:g} {y:g} {z:g} 1 1 1" for x, y, z in _TETRAHEDRON]
@@ -171,11 +180,14 @@ def test_polygons_of_off_files(tmp_path: Path) -> None:
             load_surface(tmp_path / "b.off")
 
 
+@pytest.mark.parametrize("comment", ["no picture", "TextureFile gone.png"])
 @pytest.mark.parametrize("names", ["s t", "u v", "texture_u texture_v"])
-def test_texture_coordinates_without_a_picture_do_not_hide_colours(names: str, tmp_path: Path) -> None:
+def test_texture_coordinates_without_a_picture_do_not_hide_colours(
+    names: str, comment: str, tmp_path: Path
+) -> None:
     properties = [f"property float {name}" for name in ("x y z " + names).split()]
     properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    header = ["ply", "format ascii 1.0", "element vertex 4", *properties]
+    header = ["ply", "format ascii 1.0", f"comment {comment}", "element vertex 4", *properties]
     header += ["element face 4", "property list uchar int vertex_indices", "end_header"]
     vertices = [f"{x:g} {y:g} {z:g} 0 0 255 0 0" for x, y, z in _TETRAHEDRON]
     (tmp_path / "a.ply").write_text(

@@ -29,6 +29,8 @@ def read_obj(content: bytes, files: Any) -> trimesh.Scene:
     """Reads an OBJ file in any encoding: only names and comments can have letters that are not ASCII."""
     content, names, is_coloured = obj_text.plain(content)
     libraries = obj_text.Libraries(files, names, pictures_only=is_coloured)
+    if not libraries.has_pictures:  # for texture coordinates alone trimesh makes a dark picture of its own
+        content = re.sub(rb"(?m)^vt .*$", b"", content)
     return _load(_in_triangles(content), "obj", libraries)
 
 
@@ -95,7 +97,8 @@ def _is_number(word: str) -> bool:
 def read_ply(content: bytes, files: Any) -> trimesh.Scene:
     """Reads a PLY file; texture coordinates without a picture do not hide the colours of its vertices."""
     header, end, body = ply_text.plain(content).partition(b"end_header")
-    if b"TextureFile" not in header:
+    if not _has_picture(header, files):
+        header = re.sub(rb"(?m)^comment +TextureFile.*\n", b"", header)
         header = re.sub(
             rb"(?m)^(property .*\b)(s|t|u|v|texture_u|texture_v|texcoord)[ \t]*(\r?)$", rb"\1_\2\3", header
         )
@@ -105,6 +108,14 @@ def read_ply(content: bytes, files: Any) -> trimesh.Scene:
             _scale_colours(mesh)
             _cover_polygons(mesh)
     return scene
+
+
+def _has_picture(header: bytes, files: Any) -> bool:
+    named = re.search(rb"(?m)^comment +TextureFile +(.*)$", header)
+    try:
+        return named is not None and bool(files.get(named[1].decode(errors="replace")))
+    except FileNotFoundError:  # `files` counts it
+        return False
 
 
 def _scale_colours(mesh: trimesh.Trimesh) -> None:

@@ -7,6 +7,7 @@ import dataclasses
 import glob
 import hashlib
 import io
+import logging
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,6 +39,9 @@ from train.data.surface import Surface, sample_triangles
 from train.errors import UserError
 from train.files import as_paths, write_text
 from train.processes import map_unordered
+
+# What trimesh logs, with tracebacks, is among the reasons and the missing files of a report.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 LEFT_OUT = "left_out.csv"
 """In the dataset's folder: the meshes that the last run could not use, and why."""

@@ -86,21 +86,25 @@ class Libraries:
     """The files that a mesh names; `LIBRARY` holds all of its material libraries that exist.
 
     With `pictures_only` it holds the materials that have a picture: the others would hide the colours of vertices.
+
+    Attributes:
+        has_pictures: whether a material has one.
     """
 
     def __init__(self, files: Any, names: list[str], *, pictures_only: bool) -> None:
-        self._files, self._names, self._pictures_only = files, names, pictures_only
-
-    def get(self, name: str) -> bytes:
-        if name != LIBRARY:
-            return self._files.get(name)
+        self._files = files
         found = []
-        for each in self._names:
+        for each in names:
             try:
-                found.append(self._files.get(each))
+                found.append(files.get(each))
             except FileNotFoundError:  # `files` counts it
                 continue
         materials = re.split(rb"(?m)^(?=newmtl )", b"\n".join(found))
-        return b"".join(each for each in materials if not self._pictures_only or b"map_kd " in each.lower())
+        with_picture = [each for each in materials if b"map_kd " in each.lower()]
+        self.has_pictures = bool(with_picture)
+        self._content = b"".join(with_picture if pictures_only else materials)
+
+    def get(self, name: str) -> bytes:
+        return self._content if name == LIBRARY else self._files.get(name)
 
     __getitem__ = get
