@@ -186,10 +186,15 @@ def test_masks_of_other_programs(name, values, tmp_path):
     assert read_pictures([source / "a.jpg"])[0, :, 0, 0].tolist() == [1, 1, 1]
 
 
-def test_reconstruct_refuses_a_mask_that_does_not_fit(tmp_path):
-    Image.fromarray(lawn()).save(tmp_path / "a.jpg")
-    Image.fromarray(disc(100, 30, (50, 50))).save(tmp_path / "a_mask.png")
-    with pytest.raises(UserError, match=r"a\.jpg: its mask is 100 x 100 pixels, the photograph 240 x 240"):
+@pytest.mark.parametrize(
+    ("height", "width", "remedy"),
+    [(100, 100, "make them the same size"), (240, 120, "turn the mask upright")],
+)
+def test_reconstruct_refuses_a_mask_that_does_not_fit(height, width, remedy, tmp_path):
+    Image.fromarray(lawn()[:120]).save(tmp_path / "a.jpg")
+    Image.fromarray(disc()[:height, :width]).save(tmp_path / "a_mask.png")
+    said = rf"a\.jpg: its mask is {width} x {height} pixels, the photograph 240 x 120; {remedy}"
+    with pytest.raises(UserError, match=said):
         read_pictures([tmp_path / "a.jpg"])
 
 
