@@ -345,6 +345,14 @@ def test_running_again_makes_what_is_missing_and_nothing_else(studio, cut, tmp_p
         convert_photos(studio[0], out, size=112)
 
 
+def test_pictures_made_below_the_photographs_are_not_taken_for_photographs(tmp_path):
+    Image.fromarray(lawn()).save(tmp_path / "a.jpg")
+    Image.fromarray(disc()).save(tmp_path / "a_mask.png")
+    for kept in (0, 1):
+        report = convert_photos(tmp_path, tmp_path / "cut", processes=1, size=240)
+        assert (report.kept, report.objects, report.failures) == (kept, 1, {})
+
+
 def test_wrong_arguments_are_refused(tmp_path):
     for arguments, said in (
         ({"size": 8}, "size must be between"),

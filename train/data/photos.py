@@ -128,7 +128,7 @@ def convert_photos(
     tree_files.require_between(size=(size, 16, 2048))
     if fewest < 1 or (objects is not None and objects < 1):
         raise UserError(f"fewest and objects must be at least 1; got {fewest} and {objects}")
-    by_object, failures = find_photos(source)
+    by_object, failures = find_photos(source, without=out)
     by_object = {name: photos for name, photos in by_object.items() if len(photos) >= fewest}
     if not by_object:
         few = f" of an object with at least {fewest}" if fewest > 1 else ""
@@ -163,8 +163,14 @@ def convert_photos(
     return PhotosReport(out, kept, len(made), found, dict(ways), failures)
 
 
-def find_photos(source: str | Path) -> tuple[dict[str, list[Photo]], dict[str, str]]:
+def find_photos(
+    source: str | Path, *, without: str | Path | None = None
+) -> tuple[dict[str, list[Photo]], dict[str, str]]:
     """The photographs below a folder by object, and why some files cannot be read, by name.
+
+    Args:
+        source: the folder.
+        without: a folder below it that holds no photographs, such as the pictures that an earlier run has made.
 
     Raises:
         UserError: `source` is no folder.
@@ -174,7 +180,10 @@ def find_photos(source: str | Path) -> tuple[dict[str, list[Photo]], dict[str, s
         raise UserError(f"{source} is no folder; name one that holds a folder of photographs for each object")
     by_folder: dict[Path, list[Path]] = defaultdict(list)
     failures = {}
+    made = None if without is None else Path(without).resolve()
     for path in sorted(source.rglob("*")):
+        if made in path.resolve().parents:
+            continue
         inside = path.relative_to(source)
         hidden = any(part.startswith(".") for part in inside.parts)
         if hidden or is_mask(path) or not path.is_file():
