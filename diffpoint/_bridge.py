@@ -173,6 +173,14 @@ def or_zeros(gradient: Tensor | None, like: Tensor, shape: tuple[int, ...]) -> T
     return like.new_zeros(()).expand(shape) if gradient is None else gradient
 
 
+def count_of(batch: tuple[int, ...]) -> int:
+    """How many sets leading dimensions hold. `torch.Size.numel()` would fix their sizes while torch traces."""
+    count = 1
+    for size in batch:
+        count *= size
+    return count
+
+
 def full_lengths(lengths: Tensor | None, batch: int, size: int, like: Tensor | None = None) -> Tensor:
     """`lengths` as (batch,) int64; full sets, on the device of `like`, where it is None."""
     if lengths is None:

@@ -438,7 +438,7 @@ def check_views(
         )
     _checks.check_device(function, name, camera.K, like)
     batch, shape = like.shape[0], camera.batch_shape
-    if len(shape) > 2 or (len(shape) == 2 and shape[0] not in (1, batch)):
+    if len(shape) > 2 or (len(shape) == 2 and shape[0] != 1 and shape[0] != batch):
         raise _checks.fail(
             function,
             name,
@@ -447,7 +447,7 @@ def check_views(
             "One row of cameras per cloud.",
         )
     own = shape[-1] if shape else 1
-    if views is not None and own not in (1, views):
+    if views is not None and own != 1 and own != views:
         hint = (
             f"For one camera for each of the {batch} clouds pass {name}[:, None]."
             if shape == (batch,)

@@ -236,7 +236,7 @@ def paired_sets(
     _checks.check_same_dtype(function, a=a, b=b)
     la = _checks.check_lengths(function, "a_lengths", a_lengths, batch, a.shape[-2], a)
     lb = _checks.check_lengths(function, "b_lengths", b_lengths, batch, b.shape[-2], b)
-    count = torch.Size(batch).numel()
+    count = _bridge.count_of(batch)
     a3, b3 = (x.reshape(count, *x.shape[-2:]) for x in in_space)
     la = _bridge.full_lengths(la, count, a.shape[-2], a)
     lb = _bridge.full_lengths(lb, count, b.shape[-2], b)

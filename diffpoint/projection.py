@@ -112,7 +112,7 @@ def _pseudo_render(
         for m in (rendered, index)
     ]
     closest = blocks[0].detach().argmin(-1, keepdim=True)
-    return tuple(torch.take_along_dim(m, closest, -1)[..., 0] for m in blocks)  # type: ignore[return-value]
+    return tuple(m.gather(-1, closest)[..., 0] for m in blocks)  # type: ignore[return-value]
 
 
 def _render_existing(
@@ -123,11 +123,11 @@ def _render_existing(
     depth, pixel_logits = None, points.new_full((), EMPTY_LOGIT)
     for chosen in (~exists, exists):  # existing points come last and overwrite the logits of the others
         order = chosen.to(torch.uint8).argsort(dim=1, descending=True, stable=True)
-        sorted_points = torch.take_along_dim(points, order[..., None], 1)
+        sorted_points = points.gather(1, order[..., None].expand(points.shape))
         depth, index = _pseudo_render(sorted_points, camera, upsample=upsample, lengths=chosen.sum(1))
         if points.shape[1]:
-            own = torch.take_along_dim(logits, order, 1)[:, None]
-            own = torch.take_along_dim(own, index.clamp(min=0).flatten(2), 2).view(index.shape)
+            own = logits.gather(1, order)[:, None].expand(-1, index.shape[1], -1)
+            own = own.gather(2, index.clamp(min=0).flatten(2)).view(index.shape)
             pixel_logits = torch.where(index >= 0, own, pixel_logits)
     assert depth is not None
     return depth, pixel_logits
@@ -228,9 +228,9 @@ def _distance_to(foreground: Tensor, margin: int) -> Tensor:
     pixels = pixels.to(foreground.device, torch.float32)
     flat = foreground.reshape(-1, height * width)
     counts = flat.sum(1)
-    longest = int(counts.max()) if len(flat) and _checks.readable(counts) else height * width
+    longest = int(counts.max()) if flat.shape[0] and _checks.readable(counts) else height * width
     first = flat.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :longest]
-    squared = nearest(pixels.expand(len(flat), -1, -1), pixels[first], b_lengths=counts).squared_distance
+    squared = nearest(pixels.expand(flat.shape[0], -1, -1), pixels[first], b_lengths=counts).squared_distance
     distance = torch.where(torch.isfinite(squared), squared, 1.0).sqrt().view(foreground.shape)
     (row, down), (column, across) = (_nearest_in_frame(size, margin, distance) for size in (height, width))
     return distance[..., row, :][..., column] + torch.hypot(across, down[:, None])

@@ -111,7 +111,7 @@ def earth_mover_distance(
 def _start(name: str, start: Transport | None, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Prices (B, size) and mean costs (B,) to start from; zeros and -1 without `start`."""
     batch, size = tuple(a.shape[:-2]), max(a.shape[-2], b.shape[-2])
-    count = torch.Size(batch).numel()
+    count = _bridge.count_of(batch)
     if start is None:
         return a.new_zeros((count, size)), a.new_full((count,), -1)
     if not isinstance(start, Transport):

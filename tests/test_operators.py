@@ -117,6 +117,40 @@ def test_the_layer_compiles_into_one_graph_and_exports():
     assert torch.allclose(exported(points.detach(), target), plain)
 
 
+BATCHED = {
+    "nearest": lambda a, b: dp.nearest(a, b).squared_distance,
+    "knn": lambda a, b: dp.knn(a, b, 3).squared_distance,
+    "chamfer_distance": lambda a, b: dp.chamfer_distance(a, b, squared=False).total,
+    "earth_mover_distance": lambda a, b: dp.earth_mover_distance(a, b).cost,
+    "approxmatch": dp.approxmatch,
+    "splat_depth": lambda a, _: dp.splat_depth(a, CAMERA).depth,
+}
+
+
+@pytest.mark.parametrize("name", BATCHED)
+def test_exported_for_batches_of_any_size(name):
+    class Op(torch.nn.Module):
+        def forward(self, a, b):
+            return BATCHED[name](a, b)
+
+    batch, n, m = (torch.export.Dim(size, min=4, max=99) for size in ("batch", "n", "m"))
+    sizes = {0: batch, 1: n}, {0: batch, 1: m}
+    exported = torch.export.export(Op(), (torch.rand(4, 9, 3), torch.rand(4, 8, 3)), dynamic_shapes=sizes)
+    a, b = torch.rand(5, 11, 3), torch.rand(5, 6, 3)
+    torch.testing.assert_close(exported.module()(a, b), BATCHED[name](a, b))
+
+
+def test_compiled_with_sizes_that_are_not_fixed():
+    """`size in (1, views)` is False for equal sizes while torch traces."""
+
+    def reordered(depth):
+        return dp.reproject(depth, CAMERA, CAMERA[[1, 0]]).depth
+
+    depth = torch.full((3, 2, 16, 14), 2.0)
+    compiled = torch.compile(reordered, backend="aot_eager", fullgraph=True, dynamic=True)
+    torch.testing.assert_close(compiled(depth), reordered(depth))
+
+
 LOSSES = {
     "front_constraint": dp.front_constraint,
     "front_constraint, emd": lambda *a, **k: dp.front_constraint(*a, distance="emd", tolerance=0.001, **k),
