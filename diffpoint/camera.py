@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -95,7 +95,8 @@ class PinholeCamera:
     ) -> PinholeCamera:
         """Cameras at `eye` (..., 3) that look at `target`, `up` pointing up in the image; centre in the middle.
 
-        The focal length is given in pixels, or by the vertical field of view in degrees.
+        The focal length is given in pixels, or by the vertical field of view in degrees. The dtype is that of `eye`;
+        where it holds numbers only, torch's default.
 
         Example:
             >>> PinholeCamera.look_at((2.0, 0, 0), focal_px=100.0, height=8, width=8).cam_from_world[2].tolist()
@@ -305,12 +306,18 @@ class PinholeCamera:
             self, K=self.K.to(*args, **kwargs), cam_from_world=self.cam_from_world.to(*args, **kwargs)
         )
 
-    def expand(self, *batch_shape: int) -> PinholeCamera:
-        """The same cameras with leading dimensions broadcast to `batch_shape`, without copying."""
+    def expand(self, *batch_shape: int | tuple[int, ...]) -> PinholeCamera:
+        """The same cameras with leading dimensions broadcast to `batch_shape`, without copying.
+
+        As of `torch.Tensor.expand`, the sizes may be a tuple, and -1 keeps one.
+        """
+        sizes: Any = batch_shape
+        if len(sizes) == 1 and isinstance(sizes[0], tuple):
+            sizes = sizes[0]
         return dataclasses.replace(
             self,
-            K=self.K.expand(*batch_shape, 3, 3),
-            cam_from_world=self.cam_from_world.expand(*batch_shape, 4, 4),
+            K=self.K.expand(*sizes, 3, 3),
+            cam_from_world=self.cam_from_world.expand(*sizes, 4, 4),
         )
 
     def __getitem__(self, item) -> PinholeCamera:
@@ -320,12 +327,26 @@ class PinholeCamera:
             >>> cameras = PinholeCamera(torch.eye(3), torch.eye(4).expand(5, 4, 4), 8, 8)
             >>> cameras[2].batch_shape, cameras[1:].batch_shape, cameras[:, None].batch_shape
             ((), (4,), (5, 1))
+            >>> cameras[2][None].batch_shape  # one camera as a batch of one
+            (1,)
         """
         shape = self.batch_shape
-        if not shape:
-            raise IndexError("PinholeCamera: a single camera has no leading dimension to index.")
         whole = self.expand(*shape)
-        return dataclasses.replace(self, K=whole.K[item], cam_from_world=whole.cam_from_world[item])
+        where = item if isinstance(item, tuple) else (item,)
+        if not any(each is Ellipsis for each in where):
+            where = (*where, ...)
+        where = (*where, slice(None), slice(None))  # without these an index could reach into the matrices
+        try:
+            K, cam_from_world = whole.K[where], whole.cam_from_world[where]
+        except IndexError as error:
+            if not shape:
+                raise IndexError(
+                    "PinholeCamera: a single camera has no leading dimension to index."
+                ) from None
+            raise IndexError(
+                f"PinholeCamera: cameras of batch shape {shape} have no such index: {error}"
+            ) from None
+        return dataclasses.replace(self, K=K, cam_from_world=cam_from_world)
 
     def __len__(self) -> int:
         """The first leading dimension."""
@@ -391,12 +412,16 @@ def _in_range(vectors: Tensor) -> Tensor:
 
 
 def _vector(name: str, value, like: Tensor | None = None) -> Tensor:
-    if isinstance(value, (list, tuple)) and any(isinstance(each, Tensor) for each in value):
+    dtype = torch.get_default_dtype()
+    dtype = dtype if dtype in _checks.FLOATS else torch.float32
+    inside = [each for each in value if isinstance(each, Tensor)] if isinstance(value, (list, tuple)) else []
+    if inside:
+        dtype = next((each.dtype for each in inside if each.dtype in _checks.FLOATS), dtype)
         # torch.tensor would cut them off from their gradients.
-        value = torch.stack([torch.as_tensor(each, dtype=torch.float32) for each in value])
+        value = torch.stack([torch.as_tensor(each, dtype=dtype, device=inside[0].device) for each in value])
     if not isinstance(value, Tensor):
         try:
-            value = torch.tensor(value, dtype=torch.float32) if like is None else like.new_tensor(value)
+            value = torch.tensor(value, dtype=dtype) if like is None else like.new_tensor(value)
         except (TypeError, ValueError, RuntimeError):
             raise TypeError(
                 f"PinholeCamera.look_at: '{name}' must be three numbers or a tensor (..., 3); got {value!r}."

@@ -66,6 +66,25 @@ def test_indexing_and_expanding_keep_views():
         camera[0, 0][0]
 
 
+def test_an_index_reaches_the_leading_dimensions_only():
+    camera = dp.PinholeCamera.look_at(torch.randn(2, 3, 3) + 3, focal_px=10.0, height=4, width=4)
+    single = camera[0, 0]
+    assert single[None].batch_shape == single[..., None].batch_shape == (1,)
+    assert len(single[None]) == 1
+    assert single[None, None].batch_shape == (1, 1)
+    assert camera[..., 1].batch_shape == (2,)
+    assert torch.equal(camera[..., 1].cam_from_world, camera.cam_from_world[:, 1])
+    assert camera[..., None].batch_shape == (2, 3, 1)
+    assert camera[[1, 0], :, None].batch_shape == (2, 3, 1)
+    for wrong in ((0, 0, 0), (..., 5), 2):
+        with pytest.raises(
+            IndexError, match=r"PinholeCamera: cameras of batch shape \(2, 3\) have no such index: "
+        ):
+            camera[wrong]
+    assert single.expand((5, 2)).batch_shape == (5, 2)
+    assert camera.expand((4, -1, -1)).batch_shape == camera.expand(4, -1, -1).batch_shape == (4, 2, 3)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -372,6 +391,23 @@ def test_look_at_says_what_does_not_fit() -> None:
         dp.PinholeCamera.look_at((0, 0, 1), "origin", **sizes)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="'eye' must be finite"):
         dp.PinholeCamera.look_at((0, float("nan"), 1), **sizes)
+
+
+def test_look_at_of_numbers_has_torchs_default_dtype() -> None:
+    sizes = {"focal_px": 4.0, "height": 4, "width": 4}
+    try:
+        for default, expected in (
+            (torch.float64, torch.float64),
+            (torch.bfloat16, torch.float32),
+            (torch.float32, torch.float32),
+        ):
+            torch.set_default_dtype(default)
+            assert dp.PinholeCamera.look_at((0.3, 0.0, -2.0), **sizes).dtype == expected
+    finally:
+        torch.set_default_dtype(torch.float32)
+    distance = torch.tensor(0.3, dtype=torch.float64)
+    camera = dp.PinholeCamera.look_at((0, 0, distance), **sizes)  # pyright: ignore[reportArgumentType]
+    assert camera.position[2].item() == 0.3
 
 
 def test_look_at_passes_gradients_to_tensors_in_a_tuple() -> None:
