@@ -223,9 +223,9 @@ def _distance_to(foreground: Tensor, margin: int) -> Tensor:
     added.
     """
     height, width = foreground.shape[-2:]
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    pixels = torch.stack((columns, rows, torch.zeros_like(rows)), -1).reshape(-1, 3)
-    pixels = pixels.to(foreground.device, torch.float32)
+    steps = (torch.arange(size, device=foreground.device) for size in (height, width))
+    rows, columns = torch.meshgrid(*steps, indexing="ij")
+    pixels = torch.stack((columns, rows, torch.zeros_like(rows)), -1).reshape(-1, 3).to(torch.float32)
     flat = foreground.reshape(-1, height * width)
     counts = flat.sum(1)
     longest = int(counts.max()) if flat.shape[0] and _checks.readable(counts) else height * width

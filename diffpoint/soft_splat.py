@@ -114,6 +114,7 @@ def _soft_splat_fake(
 def _soft_splat_setup(ctx, inputs, output) -> None:
     pixels, point_depth, lengths, *ctx.sizes = inputs
     depth, _, nearest, weight = output
+    depth = depth.detach().clone()  # the caller may change the result, as in depth[depth.isinf()] = 0
     ctx.mark_non_differentiable(nearest, weight)
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(pixels, point_depth, lengths, depth, nearest, weight)

@@ -327,6 +327,19 @@ def test_results_can_be_changed_in_place() -> None:
     depth.sum().backward()
     assert points.grad is not None
     assert points.grad[..., 2].tolist() == [[1, 1]]
+    (expected,) = torch.autograd.grad(dp.soft_splat(points, camera).depth.nan_to_num(posinf=0).sum(), points)
+    soft = dp.soft_splat(points, camera).depth
+    soft[soft.isinf()] = 0
+    assert torch.equal(torch.autograd.grad(soft.sum(), points)[0], expected)
+
+
+@pytest.mark.parametrize("name", sorted(LOSSES))
+@pytest.mark.filterwarnings("ignore:front_constraint:RuntimeWarning")
+def test_the_default_device_is_not_that_of_the_arguments(name) -> None:
+    points, depth = torch.rand(2, 9, 3) - 0.5, torch.full((2, 2, 16, 14), 2.0)
+    expected = LOSSES[name](points, CAMERA, depth)
+    with torch.device("meta"):
+        assert torch.equal(LOSSES[name](points, CAMERA, depth), expected)
 
 
 def test_tensors_without_values() -> None:
