@@ -9,6 +9,7 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch._C import _functorch  # pyright: ignore[reportAttributeAccessIssue]
@@ -83,7 +84,9 @@ def _kind(value: Any) -> str:
     """What a value that is no tensor is, as the end of a message."""
     kind = type(value).__name__
     hint = " Convert it with torch.from_numpy." if kind == "ndarray" else ""
-    if isinstance(value, (list, tuple)):
+    if hasattr(value, "_fields"):
+        hint = f" Pass one of its tensors: {', '.join(value._fields)}."
+    elif isinstance(value, (list, tuple)):
         inside = any(isinstance(each, Tensor) for each in value)
         hint = " Pad and stack it: torch.nn.utils.rnn.pad_sequence(..., batch_first=True), with lengths."
         hint = hint if inside else " Convert it with torch.tensor."
@@ -133,7 +136,10 @@ def check_lengths(
     if lengths is None:
         return None
     if not isinstance(lengths, torch.Tensor) or lengths.dtype not in (torch.int64, torch.int32):
-        what = f"{lengths.dtype}." if isinstance(lengths, torch.Tensor) else _kind(lengths)
+        what = _kind(lengths)
+        if isinstance(lengths, torch.Tensor):
+            hint = "Of a mask take .sum(-1)." if lengths.dtype == torch.bool else "Convert it with .long()."
+            what = f"{lengths.dtype}. {hint}"
         raise TypeError(f"{function}: '{name}' must be an integer tensor (int64); got {what}")
     if like is not None:
         check_device(function, name, lengths, like)
@@ -182,6 +188,13 @@ def check_finite(function: str, name: str, value: Tensor, lengths: Tensor | None
             f"{float(value[where])} at index {where} ({int(bad.sum())} in all)",
             "Look for a division by zero or an exploded update before this call.",
         )
+
+
+def check_filled(function: str, name: str, clouds: Tensor, lengths: Tensor | None = None) -> None:
+    """Finite clouds (*, N, 3) of at least one point, for functions that hand them on under another name."""
+    if clouds.shape[-2] == 0 and math.prod(clouds.shape[:-2]):  # a batch of no clouds has no empty one
+        raise fail(function, name, "hold at least one point", str(tuple(clouds.shape)))
+    check_finite(function, name, clouds.detach(), lengths)
 
 
 def check_sets(
@@ -259,7 +272,7 @@ def check_depth(function: str, name: str, depth: Tensor) -> None:
             name,
             "be positive, and +inf where empty",
             f"{float(depth[where])} at index {where}",
-            "If 0 marks empty pixels: depth.masked_fill(depth == 0, float('inf')).",
+            "If 0, -1 or NaN marks empty pixels: depth.masked_fill(~(depth > 0), float('inf')).",
         )
 
 
@@ -324,6 +337,15 @@ def check_integer(function: str, name: str, value: Any, expected: str, smallest:
     if number is None or number < smallest:
         raise fail(function, name, expected, repr(value))
     return number
+
+
+def check_flag(function: str, name: str, value: Any) -> bool:
+    """True or False, of Python or numpy: a word such as "no" would count as True."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(
+            f"{function}: '{name}' must be True or False; got {value!r} ({type(value).__name__})."
+        )
+    return bool(value)
 
 
 def check_choice(function: str, name: str, value: str, choices: tuple[str, ...]) -> None:

@@ -233,6 +233,8 @@ def configure(*, threads: int | None = None, cache: bool | None = None, checks: 
     """
     if threads is not None:
         threads = _checks.check_integer("configure", "threads", threads, "be a positive integer or None", 1)
+    if cache is not None:
+        cache = _checks.check_flag("configure", "cache", cache)
     if checks is not None:
         _checks.check_choice("configure", "checks", checks, get_args(Checks))
     with RUNTIME.lock:

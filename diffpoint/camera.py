@@ -222,6 +222,7 @@ class PinholeCamera:
             >>> camera.to_pytorch3d().principal_point.tolist(), camera.to_pytorch3d(in_ndc=True).focal_length.tolist()
             ([[40.0, 20.0]], [[5.0, 5.0]])
         """
+        in_ndc = _checks.check_flag("PinholeCamera.to_pytorch3d", "in_ndc", in_ndc)
         whole = self.expand(*self.batch_shape)
         K, cam_from_world = whole.K.reshape(-1, 3, 3), whole.cam_from_world.reshape(-1, 4, 4)
         return _conversions.to_pytorch3d(K, cam_from_world, self.height, self.width, in_ndc)
@@ -447,6 +448,11 @@ class Views(NamedTuple):
         return self.camera.back_projection.expand(*self.batch_shape, 3, 4)
 
 
+def check_camera(function: str, name: str, camera: object) -> None:
+    if not isinstance(camera, PinholeCamera):
+        raise TypeError(f"{function}: '{name}' must be a PinholeCamera; got {type(camera).__name__}.")
+
+
 def check_views(
     function: str, name: str, camera: PinholeCamera, like: Tensor, *, views: int | None = None
 ) -> Views:
@@ -454,8 +460,7 @@ def check_views(
 
     `views`: the number of depth maps per item; the camera must have as many views, or one.
     """
-    if not isinstance(camera, PinholeCamera):
-        raise TypeError(f"{function}: '{name}' must be a PinholeCamera; got {type(camera).__name__}.")
+    check_camera(function, name, camera)
     if camera.dtype != like.dtype:
         raise TypeError(
             f"{function}: '{name}' must have the dtype of the points ({like.dtype}); got {camera.dtype}. "

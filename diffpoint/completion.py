@@ -45,9 +45,9 @@ def minimal_matching_distance(
     _checks.check_tensor(name, "samples", samples, ("*", "S", "N", 3))
     _checks.check_tensor(name, "references", references, (*samples.shape[:-3], "R", "M", 3))
     _checks.check_same_dtype(name, samples=samples, references=references)
-    _checks.check_finite(name, "samples", samples.detach())
-    _checks.check_finite(name, "references", references.detach())
+    squared = _checks.check_flag(name, "squared", squared)
     for argument, clouds in (("samples", samples), ("references", references)):
+        _checks.check_filled(name, argument, clouds)
         _check_some(name, argument, clouds)
     points = samples.shape[:-2].numel() * max(samples.shape[-2], references.shape[-2])
     at_once = references.detach().split(max(1, _POINTS_AT_ONCE // max(1, points)), -3)
@@ -90,7 +90,8 @@ def total_mutual_difference(clouds: Tensor, *, squared: bool, reduction: Reducti
     """
     name = "total_mutual_difference"
     _checks.check_tensor(name, "clouds", clouds, ("*", "K", "N", 3))
-    _checks.check_finite(name, "clouds", clouds.detach())
+    squared = _checks.check_flag(name, "squared", squared)
+    _checks.check_filled(name, "clouds", clouds)
     count = clouds.shape[-3]
     first, second = pairs(name, "clouds", count)
     between = chamfer_distance(clouds[..., first, :, :], clouds[..., second, :, :], squared=squared).total
@@ -133,8 +134,8 @@ def unidirectional_hausdorff_distance(
     lengths = _checks.check_lengths(
         name, "partial_lengths", partial_lengths, tuple(partial.shape[:-2]), partial.shape[-2], partial
     )
-    _checks.check_finite(name, "partial", partial.detach(), lengths)
-    _checks.check_finite(name, "completions", completions.detach())
+    _checks.check_filled(name, "partial", partial, lengths)
+    _checks.check_filled(name, "completions", completions)
     _check_some(name, "completions", completions)
     every = partial.unsqueeze(-3).expand(*completions.shape[:-2], *partial.shape[-2:])
     if lengths is not None:

@@ -112,6 +112,7 @@ def chamfer_distance(
         [1.0, 3.0]
     """
     a3, b3, la, lb, batch = paired_sets("chamfer_distance", a, b, a_lengths, b_lengths)
+    squared = _checks.check_flag("chamfer_distance", "squared", squared)
     _checks.check_choice("chamfer_distance", "reduction", reduction, ("mean", "sum", "max", "none"))
     from_a, _, from_b, _ = _nearest_both(a3, b3, la, lb)
     directions = []
@@ -159,8 +160,8 @@ def hausdorff_distance(
         5.0
     """
     paired_sets("hausdorff_distance", a, b, a_lengths, b_lengths)  # errors are to name this function
-    _checks.check_finite("hausdorff_distance", "a", a.detach(), a_lengths)
-    _checks.check_finite("hausdorff_distance", "b", b.detach(), b_lengths)
+    _checks.check_filled("hausdorff_distance", "a", a, a_lengths)
+    _checks.check_filled("hausdorff_distance", "b", b, b_lengths)
     directed = chamfer_distance(
         a, b, squared=False, reduction="max", a_lengths=a_lengths, b_lengths=b_lengths
     )
@@ -226,12 +227,12 @@ def paired_sets(
     batch = tuple(a.shape[:-2])
     if b.shape[:-2] != a.shape[:-2] or b.shape[-1] != a.shape[-1]:
         wanted = "(" + "".join(f"{s}, " for s in batch) + f"M, {a.shape[-1]}) to match 'a'"
-        same_space = b.shape[-1] == a.shape[-1]
-        hint = (
-            "Did you forget to batch?"
-            if same_space
-            else "A distance is in space or in the plane, not between."
-        )
+        if b.shape[-1] != a.shape[-1]:
+            hint = "A distance is in space or in the plane, not between."
+        elif b.dim() != a.dim():
+            hint = "Did you forget to batch?"
+        else:
+            hint = "Nothing is broadcast: expand the smaller batch, for instance b.expand(len(a), -1, -1)."
         raise _checks.fail(function, "b", f"have shape {wanted}", str(tuple(b.shape)), hint)
     _checks.check_same_dtype(function, a=a, b=b)
     la = _checks.check_lengths(function, "a_lengths", a_lengths, batch, a.shape[-2], a)

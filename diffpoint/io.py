@@ -26,6 +26,7 @@ def encode_depth(depth: Tensor, *, max_depth: float = 10.0) -> np.ndarray:
         >>> encode_depth(torch.tensor([2.0, float("inf")])).tolist()
         [13107, 65535]
     """
+    _checks.check_tensor("encode_depth", "depth", depth, ("*",))
     max_depth = _check_max_depth("encode_depth", max_depth)
     code = (depth.detach().double() * (_EMPTY / max_depth)).round().clamp(0, _EMPTY - 1)
     return torch.where(torch.isfinite(depth), code, _EMPTY).cpu().numpy().astype(np.uint16)
@@ -38,6 +39,8 @@ def decode_depth(code: np.ndarray, *, max_depth: float = 10.0) -> Tensor:
         >>> decode_depth(np.array([13107, 65535], np.uint16)).tolist()
         [2.0, inf]
     """
+    if not isinstance(code, np.ndarray):
+        raise TypeError(f"decode_depth: 'code' must be a numpy.ndarray; got {type(code).__name__}.")
     max_depth = _check_max_depth("decode_depth", max_depth)
     depth = code.astype(np.float64) * (max_depth / _EMPTY)
     return torch.from_numpy(np.where(code == _EMPTY, np.inf, depth).astype(np.float32))
@@ -90,9 +93,7 @@ def write_points(path: str | os.PathLike[str], points: Tensor) -> None:
         ImportError: trimesh is not installed.
     """
     _checks.check_tensor("write_points", "points", points, ("N", 3))
-    _checks.check_finite("write_points", "points", points.detach())
-    if len(points) == 0:
-        raise _checks.fail("write_points", "points", "hold at least one point", "none")
+    _checks.check_filled("write_points", "points", points)
     path = Path(path)
     suffix = path.suffix.lower() or ".ply"
     if suffix not in _WRITABLE:

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from diffpoint import _checks
-from diffpoint.camera import PinholeCamera, check_views
+from diffpoint.camera import PinholeCamera, check_camera, check_views
 from diffpoint.distances import chamfer_distance
 from diffpoint.reproject import unproject
 from diffpoint.transport import earth_mover_distance
 from diffpoint.views import sample_view
-from diffpoint.visibility import Method, visible_points
+from diffpoint.visibility import METHODS, Method, visible_points
 
 Reduction = Literal["mean", "none"]
 Distance = Literal["chamfer", "emd"]
@@ -83,6 +83,7 @@ def _front_sets(
 ) -> tuple[FrontSets, _Counts | None]:
     """The sets, and what is known of their sizes; None where sizes must not depend on values (see `readable`)."""
     batch, views = check_maps(function, points, camera, depth)
+    _checks.check_choice(function, "visibility", visibility, METHODS)
     sample = sample_view(points, visible_points(points, camera, method=visibility))
     seen = sample.points.expand(batch, views, -1, 3)
     lengths = sample.lengths.expand(batch, views)
@@ -285,6 +286,7 @@ def diversity_loss(
     _checks.check_same_dtype("diversity_loss", codes=codes, clouds=clouds)
     alpha = _checks.check_number("diversity_loss", "alpha", alpha, "be finite", math.isfinite)
     _checks.check_finite("diversity_loss", "codes", codes.detach())
+    _checks.check_filled("diversity_loss", "clouds", clouds)
     first, second = pairs("diversity_loss", "codes", codes.shape[0])
     apart = (codes[first] - codes[second]).norm(dim=-1)
     # From this distance on the hinge is 0, so the exact distance is not needed.
@@ -315,6 +317,7 @@ def consistency_loss(clouds: Tensor, *, reduction: Reduction = "mean") -> Tensor
         1.3333333730697632
     """
     _checks.check_tensor("consistency_loss", "clouds", clouds, ("*", "V", "N", 3))
+    _checks.check_filled("consistency_loss", "clouds", clouds)
     first, second = pairs("consistency_loss", "clouds", clouds.shape[-3])
     both = chamfer_distance(clouds[..., first, :, :], clouds[..., second, :, :], squared=False)
     return reduce_loss("consistency_loss", both.total.mean(-1), reduction)
@@ -331,6 +334,7 @@ def pairs(function: str, argument: str, count: int) -> tuple[list[int], list[int
 def check_maps(function: str, points: Tensor, camera: PinholeCamera, depth: Tensor) -> tuple[int, int]:
     """Check depth maps against clouds and cameras; returns (B, V)."""
     _checks.check_clouds(function, "points", points)
+    check_camera(function, "camera", camera)
     _checks.check_tensor(function, "depth", depth, (points.shape[0], "V", camera.height, camera.width))
     _checks.check_same_dtype(function, points=points, depth=depth)
     check_views(function, "camera", camera, points, views=depth.shape[1])

@@ -65,6 +65,7 @@ def knn(
     reach = torch.inf
     if radius is not None:
         reach = _checks.check_number("knn", "radius", radius, "be a number of at least 0", lambda r: r >= 0)
+    exclude_self = _checks.check_flag("knn", "exclude_self", exclude_self)
     if exclude_self:
         _checks.check_shape(
             "knn", "b", b, tuple(a.shape), "With exclude_self=True, pass the points of 'a' again."

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffpoint import _bridge, _checks
 from diffpoint._parts import sum_of_parts, summed_parts
-from diffpoint.camera import PinholeCamera, PointSets, Projection, Views, check_views
+from diffpoint.camera import PinholeCamera, PointSets, Projection, Views, check_camera, check_views
 
 _TILE = 8  # as in kernels/reproject.py
 
@@ -105,6 +105,7 @@ def reproject(depth: Tensor, source: PinholeCamera, target: PinholeCamera) -> Re
 def _depth_views(function: str, depth: Tensor, name: str, camera: PinholeCamera) -> Views:
     """The camera expanded to the (B, V) of the depth maps, of their size and dtype."""
     _checks.check_tensor(function, "depth", depth, ("B", "V", "H", "W"))
+    check_camera(function, name, camera)
     _, count, height, width = depth.shape
     if (height, width) != (camera.height, camera.width):
         raise _checks.fail(

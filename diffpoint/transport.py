@@ -89,6 +89,7 @@ def earth_mover_distance(
     name = "earth_mover_distance"
     a3, b3, la, lb, batch = paired_sets(name, a, b, a_lengths, b_lengths)
     tolerance = _checks.check_number(name, "tolerance", tolerance, "lie between 0 and 1", lambda x: 0 < x < 1)
+    squared = _checks.check_flag(name, "squared", squared)
     prices, known_cost = _start(name, start, a, b)
     if enough is None:
         limit = a.new_full((a3.shape[0],), torch.inf)

@@ -208,6 +208,71 @@ def test_what_is_no_camera(op):
         op(torch.rand(2, 5, 3), torch.eye(3))
 
 
+@pytest.mark.parametrize(
+    "op", [dp.front_sets, dp.front_constraint, dp.projection_loss, dp.soft_projection_loss]
+)
+def test_camera_and_depth_in_the_wrong_order(op):
+    with pytest.raises(TypeError, match=rf"^{op.__name__}: 'camera' must be a PinholeCamera; got Tensor"):
+        op(POINTS, DEPTH, CAMERA)
+
+
+@pytest.mark.parametrize(("op", "name"), [(dp.unproject, "camera"), (dp.reproject, "source")])
+def test_a_depth_map_in_place_of_a_camera(op, name):
+    with pytest.raises(TypeError, match=rf"^{op.__name__}: '{name}' must be a PinholeCamera; got Tensor"):
+        op(DEPTH, *(DEPTH,) * (1 if name == "camera" else 2))
+
+
+@pytest.mark.parametrize("op", STACKS)
+@pytest.mark.parametrize("bad", ["nan", "empty"])
+def test_errors_of_stacks_name_the_callers_argument(op, bad):
+    function, argument = op.split()
+    points = torch.rand(2, 0, 3) if bad == "empty" else torch.full((2, 7, 3), torch.nan)
+    with pytest.raises(
+        ValueError, match=rf"^{function}: '{argument}' must (hold at least one point|be finite)"
+    ):
+        STACKS[op](points)
+
+
+FLAGS: Ops = {
+    "chamfer_distance squared": lambda x: dp.chamfer_distance(POINTS, POINTS, squared=x),
+    "earth_mover_distance squared": lambda x: dp.earth_mover_distance(POINTS, POINTS, squared=x),
+    "minimal_matching_distance squared": lambda x: dp.minimal_matching_distance(POINTS, POINTS, squared=x),
+    "total_mutual_difference squared": lambda x: dp.total_mutual_difference(POINTS, squared=x),
+    "knn exclude_self": lambda x: dp.knn(POINTS, POINTS, 2, exclude_self=x),
+    "PinholeCamera.to_pytorch3d in_ndc": lambda x: CAMERA.to_pytorch3d(in_ndc=x),
+}
+
+
+@pytest.mark.parametrize("op", FLAGS)
+def test_flags_are_true_or_false(op):
+    function, name = op.split()
+    for flag in (True, False):
+        assert all(map(torch.equal, leaves(FLAGS[op](flag)), leaves(FLAGS[op](np.bool_(flag)))))
+    for other in ("no", None, 1, torch.tensor(True)):
+        with pytest.raises(TypeError, match=rf"^{function}: '{name}' must be True or False; got "):
+            FLAGS[op](other)
+
+
+def test_hints_say_what_to_do():
+    for call, hint in (
+        (lambda: dp.nearest(POINTS, POINTS[:1]), r"b\.expand\(len\(a\), -1, -1\)"),
+        (lambda: dp.nearest(POINTS, POINTS[0]), "Did you forget to batch"),
+        (lambda: dp.unproject(-DEPTH, CAMERA), r"masked_fill\(~\(depth > 0\), float\('inf'\)\)"),
+        (
+            lambda: dp.nearest(POINTS, dp.unproject(DEPTH, CAMERA)),
+            "got PointSets. Pass one of its tensors: points",
+        ),
+        (lambda: dp.nearest(POINTS, POINTS, a_lengths=POINTS[..., 0] > 0), r"Of a mask take \.sum\(-1\)"),
+        (lambda: dp.nearest(POINTS, POINTS, a_lengths=torch.ones(2)), r"Convert it with \.long\(\)"),
+        (
+            lambda: dp.front_sets(POINTS, CAMERA, DEPTH, visibility="all"),
+            "^front_sets: 'visibility' must be one of",
+        ),
+    ):
+        with pytest.raises((TypeError, ValueError), match=hint):
+            call()
+
+
 def test_options_out_of_range():
     points = torch.rand(2, 5, 3)
     for call, message in (

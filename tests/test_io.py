@@ -73,6 +73,10 @@ def test_what_is_no_cloud_and_no_map_is_refused(tmp_path):
         io.write_depth(tmp_path / "d.png", torch.full((2, 2), 11.0))
     with pytest.raises(ValueError, match="'points' must be finite"):
         io.write_points(tmp_path / "c.ply", torch.full((2, 3), torch.nan))
+    with pytest.raises(TypeError, match=r"encode_depth: 'depth' must be a torch\.Tensor; got ndarray"):
+        io.encode_depth(torch.ones(2).numpy())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"decode_depth: 'code' must be a numpy\.ndarray; got Tensor"):
+        io.decode_depth(torch.ones(2))  # pyright: ignore[reportArgumentType]
     import imageio.v3
 
     imageio.v3.imwrite(tmp_path / "eight.png", torch.zeros(4, 4, dtype=torch.uint8).numpy())
