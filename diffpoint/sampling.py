@@ -51,9 +51,15 @@ def farthest_point_sample(
     points = _checks.check_points(name, "points", points, "N")
     batch = tuple(points.shape[:-2])
     lengths = _checks.check_lengths(name, "lengths", lengths, batch, points.shape[-2], points)
+    allow_fewer = _checks.check_flag(name, "allow_fewer", allow_fewer)
+    if not isinstance(generator, torch.Generator | None):
+        raise TypeError(
+            f"{name}: 'generator' must be a torch.Generator or None; got {type(generator).__name__}. "
+            "For a seed: torch.Generator().manual_seed(0)."
+        )
     if generator is not None and not isinstance(start, str):
         raise _checks.fail(name, "generator", "be None without start='random'", repr(generator))
-    flat = points.reshape(torch.Size(batch).numel(), *points.shape[-2:])
+    flat = points.reshape(_bridge.count_of(batch), *points.shape[-2:])
     lengths = _bridge.full_lengths(lengths, flat.shape[0], flat.shape[1], flat)
     counts, width = _integers("k", k, flat, batch), -1 if isinstance(k, Tensor) else int(k)
     if isinstance(start, str):

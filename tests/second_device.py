@@ -312,7 +312,7 @@ def a_run_begun_on_one_device_goes_on_on_another(data: Path, run: Path) -> None:
         assert len(apart[0]) == 18
         names = ("step", "loss", "front", "val_cd", "val_fps_cd", "image_sensitivity")
         chosen = [[{k: v for k, v in r.items() if k in names} for r in records] for records in apart]
-        close(*chosen, tolerance=2e-2)  # 18 steps, see `_trained`
+        close(*chosen, tolerance=5e-2)  # 18 steps, see `_trained`
         assert weights_digest(load_generator(out, device="elsewhere:0")) == weights_digest(
             load_generator(out)
         )

@@ -239,6 +239,7 @@ FLAGS: Ops = {
     "minimal_matching_distance squared": lambda x: dp.minimal_matching_distance(POINTS, POINTS, squared=x),
     "total_mutual_difference squared": lambda x: dp.total_mutual_difference(POINTS, squared=x),
     "knn exclude_self": lambda x: dp.knn(POINTS, POINTS, 2, exclude_self=x),
+    "farthest_point_sample allow_fewer": lambda x: dp.farthest_point_sample(POINTS, 3, allow_fewer=x),
     "PinholeCamera.to_pytorch3d in_ndc": lambda x: CAMERA.to_pytorch3d(in_ndc=x),
 }
 
@@ -254,6 +255,10 @@ def test_flags_are_true_or_false(op):
 
 
 def test_hints_say_what_to_do():
+    with pytest.raises(
+        TypeError, match=r"'generator' must be a torch\.Generator or None; got int\. .*manual_seed"
+    ):
+        dp.farthest_point_sample(POINTS, 3, start="random", generator=0)  # pyright: ignore[reportArgumentType]
     for call, hint in (
         (lambda: dp.nearest(POINTS, POINTS[:1]), r"b\.expand\(len\(a\), -1, -1\)"),
         (lambda: dp.nearest(POINTS, POINTS[0]), "Did you forget to batch"),

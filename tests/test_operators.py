@@ -123,6 +123,7 @@ BATCHED = {
     "chamfer_distance": lambda a, b: dp.chamfer_distance(a, b, squared=False).total,
     "earth_mover_distance": lambda a, b: dp.earth_mover_distance(a, b).cost,
     "approxmatch": dp.approxmatch,
+    "farthest_point_sample": lambda a, _: dp.farthest_point_sample(a, 3),
     "splat_depth": lambda a, _: dp.splat_depth(a, CAMERA).depth,
 }
 
