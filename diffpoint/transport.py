@@ -203,6 +203,7 @@ def _transport(
     lists = size + helpers * _ROUND
     # Of every person the objects that it may bid for next without a look at all others.
     offers = torch.zeros((count, lists, LANES), dtype=torch.int32), a.new_zeros((count, lists, LANES))
+    seconds = a.new_empty((count, 1 + helpers, LANES))
     _bridge.launch(
         "transport",
         "auction_of_squares" if squared else "auction",
@@ -224,6 +225,8 @@ def _transport(
         *offers,
         *(x.view(count, -1) for x in offers),
         a.new_empty((count, lists)),
+        seconds,
+        seconds.view(count, -1),
         a.new_empty((count, size)),
         torch.zeros((count, 64), dtype=torch.int32),
         torch.zeros((count, _ROUND), dtype=torch.int32),
