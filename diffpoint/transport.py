@@ -13,7 +13,7 @@ from diffpoint.blocks import LANES
 from diffpoint.distances import paired_sets
 from diffpoint.sampling import lanes
 
-_ROUND = 16  # persons for whom all objects are scanned at the same prices; at most 64
+_ROUND = 64  # persons for whom all objects are scanned at the same prices; at most 64
 # Pairs whose sizes have at least this product are each shared out among HELPERS more threads, if there are no more
 # pairs than that. Which threads there are changes only the time.
 _SHARED = 2**20
