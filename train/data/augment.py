@@ -98,7 +98,7 @@ def _random_numbers(images: Tensor, seeds: Tensor) -> tuple[Tensor, Tensor]:
 class FramedViews:
     """The views (V, 3, h, w) uint8 of a shape, each framed as `cutout` frames a photograph when it is read."""
 
-    views: PackedViews | Tensor
+    views: PackedViews | FramedViews | Tensor
 
     @property
     def shape(self) -> tuple[int, ...]:
