@@ -92,7 +92,7 @@ def test_defaults_are_those_by_which_kept_results_are_known() -> None:
         for settings in (FitConfig, StageConfig, PretrainConfig, InferenceConfig)
     }
     assert defaults == {
-        "FitConfig": "f556069158bed21a",
+        "FitConfig": "d854ccb9fa365f25",
         "StageConfig": "e93fe16768be9d63",
         "PretrainConfig": "4cf85f0401cf8eb3",
         "InferenceConfig": "f2402cf6aa4880e1",
