@@ -42,6 +42,14 @@ def picture(tmp_path: Path) -> Path:
         ("fit --data {data} --out {tmp}/noise.png --profile smoke", "noise.png is a file"),
         ("fit --data {data} --out {tmp}/out --profile smoke --resume", "no run to resume"),
         ("fit --data {data} --out {tmp}/out --profile smoke --steps 0", "--steps must be at least 1"),
+        (
+            "fit --data {data} --out {tmp}/out --profile smoke --framing 2",
+            "--framing is a share of the images",
+        ),
+        (
+            "fit --data {data} --out {tmp}/out --profile smoke --augmentation=-1",
+            "--augmentation must be at least 0",
+        ),
         ("fit --data {data} --out {tmp}/out --profile cpu", "not a multiple of the map size 28"),
         ("fit --data {data} --out {tmp}/out --profile smoke --categories zebra", "zebra"),
         ("fit --data {data} --out {tmp}/out --profile smoke --stage1.views 9", "configuration asks for 9"),

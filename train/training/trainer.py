@@ -80,6 +80,10 @@ def fit(
     _check_run_directory(out, config, resume=resume)
     method = get_method(config.system)
     method.check(config)
+    if config.augmentation < 0:
+        raise UserError(f"--augmentation must be at least 0; got {config.augmentation}")
+    if not 0 <= config.framing <= 1:
+        raise UserError(f"--framing is a share of the images, from 0 to 1; got {config.framing}")
     _check_precision(config, world.device)
     require_depth(roots)
     image_size = method.image_size(config)
