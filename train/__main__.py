@@ -332,9 +332,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Daemons close their outputs, for which Python has None; libraries ask it whether it is a terminal.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    if isinstance(
-        sys.stdout, io.TextIOWrapper
-    ):  # as stderr is: a name of a file may have letters it cannot print
+    # As stderr is: a name of a file may have letters it cannot print.
+    if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:

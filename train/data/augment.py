@@ -59,16 +59,8 @@ def augment(images: Tensor, strength: float, seeds: Tensor, *, framing: float = 
     def sometimes(values: Tensor) -> Tensor:
         return torch.where(next(unused) < _SPOILT_SHARE, values, 0)
 
-    middle, side = _frames(images)
-    framed = numbers[:, -1] < framing
-    images = _cut(
-        images,
-        torch.where(framed[:, None], middle, 0),
-        torch.where(framed, side, 1),
-        shift=draw(_SHIFT, 2),
-        scale=1 + draw(_SCALE),
-        turn=draw(_TURN),
-    )
+    frames = _frames(images, numbers[:, -1] < framing) if framing > 0 else _whole(images)
+    images = _cut(images, *frames, shift=draw(_SHIFT, 2), scale=1 + draw(_SCALE), turn=draw(_TURN))
     empty = (images.amin(1, keepdim=True) >= _WHITE).to(images.dtype)
     mix = torch.eye(3, device=images.device) + draw(_COLOUR_MIX, 3, 3)
     coloured = torch.einsum("bij,bjhw->bihw", mix / mix.sum(-1, keepdim=True), images)
@@ -98,7 +90,7 @@ def _random_numbers(images: Tensor, seeds: Tensor) -> tuple[Tensor, Tensor]:
 class FramedViews:
     """The views (V, 3, h, w) uint8 of a shape, each framed as `cutout` frames a photograph when it is read."""
 
-    views: PackedViews | FramedViews | Tensor
+    views: StoredViews | Tensor
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -110,30 +102,38 @@ class FramedViews:
 
     def __getitem__(self, chosen: Tensor | slice) -> Tensor:
         images = self.views[chosen].float() / 255
-        zero, one = images.new_zeros(len(images)), images.new_ones(len(images))
-        framed = _cut(images, *_frames(images), shift=images.new_zeros(len(images), 2), scale=one, turn=zero)
+        no_shift, as_large = _whole(images)
+        every = torch.ones_like(as_large, dtype=torch.bool)
+        frames = _frames(images, every)
+        framed = _cut(images, *frames, shift=no_shift, scale=as_large, turn=torch.zeros_like(as_large))
         return (framed * 255).round().to(torch.uint8)
 
 
-def _frames(images: Tensor) -> tuple[Tensor, Tensor]:
+StoredViews = PackedViews | FramedViews
+
+
+def _whole(images: Tensor) -> tuple[Tensor, Tensor]:
+    """The frames of whole pictures, see `_frames`."""
+    return images.new_zeros(len(images), 2), images.new_ones(len(images))
+
+
+def _frames(images: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
     """The frame of a photograph around each object: its middle (B, 2), in [-1, 1], and its side (B,), 1 for the whole
-    picture. That is the frame where nothing is to be seen."""
+    picture. That is the frame of images that are not chosen (B,), or show nothing."""
     covered = images.amin(1) < _WHITE
-    ends = []
-    for on_axis in (covered.any(1), covered.any(2)):  # columns, rows
-        size = on_axis.shape[1]
-        place = torch.arange(size, device=images.device).expand_as(on_axis)
-        ends.append(
-            (
-                torch.where(on_axis, place, size).amin(1) / size,
-                torch.where(on_axis, place + 1, 0).amax(1) / size,
-            )
-        )
-    first, last = (torch.stack(each, 1) for each in zip(*ends, strict=True))
+    across, down = _ends(covered.any(1)), _ends(covered.any(2))
+    first, last = torch.stack((across[0], down[0]), 1), torch.stack((across[1], down[1]), 1)
     extent = last - first
     side = torch.maximum(extent.norm(dim=1) / FILL, extent.amax(1) / LONGEST)
-    empty = ~covered.flatten(1).any(1)
-    return (first + last - 1).masked_fill(empty[:, None], 0), side.masked_fill(empty, 1)
+    whole = ~(chosen & covered.flatten(1).any(1))
+    return (first + last - 1).masked_fill(whole[:, None], 0), side.masked_fill(whole, 1)
+
+
+def _ends(covered: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the covered places (B, N) along an axis begin and end, as shares of it."""
+    size = covered.shape[1]
+    place = torch.arange(size, device=covered.device).expand_as(covered)
+    return torch.where(covered, place, size).amin(1) / size, torch.where(covered, place + 1, 0).amax(1) / size
 
 
 def _cut(

@@ -22,7 +22,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from diffpoint import PinholeCamera
-from train.data.augment import FramedViews
+from train.data.augment import FramedViews, StoredViews
 from train.data.cache import prepare
 from train.data.packed import PackedShape, PackedViews
 from train.data.shrink import Pool, Sizes
@@ -46,7 +46,7 @@ class LoadedSplit:
         categories: category name of every shape.
     """
 
-    images: Sequence[PackedViews | FramedViews] | Tensor
+    images: Sequence[StoredViews] | Tensor
     depth: Sequence[PackedViews] | Tensor
     K: Tensor
     cam_from_world: Tensor
@@ -123,9 +123,7 @@ class LoadedSplit:
         """(B,) shape and (B, N) point numbers -> (B, N, 3) of the ground truth."""
         return self.points[moved(shapes[:, None], self.device), moved(points, self.device)]
 
-    def _picked(
-        self, values: Sequence[PackedViews | FramedViews] | Tensor, shapes: Tensor, views: Tensor
-    ) -> Tensor:
+    def _picked(self, values: Sequence[StoredViews] | Tensor, shapes: Tensor, views: Tensor) -> Tensor:
         """M of (V, ...), (B,) shape and (B, V') view numbers -> (B, V', ...)."""
         if isinstance(values, Tensor):
             return values[moved(shapes[:, None], self.device), moved(views, self.device)]
@@ -133,11 +131,11 @@ class LoadedSplit:
         return moved(torch.stack(picked), self.device)
 
 
-def _unpacked_bytes(values: Sequence[PackedViews | FramedViews]) -> int:
+def _unpacked_bytes(values: Sequence[StoredViews]) -> int:
     return len(values) * math.prod(values[0].shape) * values[0].dtype.itemsize
 
 
-def _unpacked(values: Sequence[PackedViews | FramedViews], device: torch.device) -> Tensor:
+def _unpacked(values: Sequence[StoredViews], device: torch.device) -> Tensor:
     """(M, V, ...)."""
     found = torch.empty((len(values), *values[0].shape), dtype=values[0].dtype, device=device)
     for into, packed in zip(found, values, strict=True):

@@ -102,10 +102,8 @@ def cut_out(rgba: np.ndarray, *, size: int = 224, given: np.ndarray | None = Non
 def _mask_values(given: np.ndarray, height: int, width: int) -> np.ndarray:
     if given.shape[:2] != (height, width):
         remedy = "make them the same size"
-        if given.shape[:2] == (
-            width,
-            height,
-        ):  # cameras store the pixels as they were held, programs may not ask how
+        # Cameras store the pixels as they were held, programs may not ask how.
+        if given.shape[:2] == (width, height):
             remedy = "turn the mask upright, as the photograph is shown"
         raise UserError(
             f"its mask is {given.shape[1]} x {given.shape[0]} pixels, the photograph {width} x {height}; {remedy}"

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from train.data.gltf_pose import pose
+from train.data.gltf_pose import DRACO, is_compressed, pose
 
 _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -25,9 +25,8 @@ _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _FAN = 6
 _TRIANGLES = 4
 
-_DRACO = "KHR_draco_mesh_compression"
 _HARMLESS = (
-    _DRACO, "KHR_mesh_quantization", "KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_animation_", "KHR_xmp",
+    DRACO, "KHR_mesh_quantization", "KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_animation_", "KHR_xmp",
     "EXT_texture_", "EXT_lights_", "MSFT_texture_", "MSFT_packing_", "ADOBE_materials_", "VRM",
 )  # fmt: skip
 """How the names of extensions begin that leave the geometry as it is, or that are read."""
@@ -46,7 +45,7 @@ def plain(content: bytes, file_content: Callable[[str], bytes]) -> bytes:
     """
     scene, binary = _split(content)
     required = scene.get("extensionsRequired", ())
-    if _DRACO in required and importlib.util.find_spec("DracoPy") is None:
+    if DRACO in required and importlib.util.find_spec("DracoPy") is None:
         raise ValueError(
             "its geometry is compressed with Draco: pip install DracoPy, or save it uncompressed"
         )
@@ -67,7 +66,7 @@ def plain(content: bytes, file_content: Callable[[str], bytes]) -> bytes:
         colours["baseColorFactor"] = [*(colour if by_trimesh else _as_seen(np.array(colour)).tolist()), alpha]
     for mesh in scene.get("meshes", ()):
         for primitive in mesh["primitives"]:
-            if _DRACO not in primitive.get("extensions", {}):
+            if not is_compressed(primitive):
                 document.unroll_fan(primitive)
                 document.transform_uv(primitive)
                 document.convert_colours(primitive, linear=not by_trimesh)
@@ -253,9 +252,7 @@ class _Document:
         """Makes the colours of vertices floats, as those of pictures."""
         attributes = primitive["attributes"]
         if "COLOR_0" in attributes:
-            accessor = self.scene["accessors"][attributes["COLOR_0"]] | {
-                "normalized": True
-            }  # not all files say so
-            colours = self.read_scaled(accessor)[:, :3]
+            accessor = self.scene["accessors"][attributes["COLOR_0"]]
+            colours = self.read_scaled(accessor | {"normalized": True})[:, :3]  # not all files say so
             colours = _as_seen(colours) if linear else colours
             attributes["COLOR_0"] = self.add(colours, 5126, "VEC3")

@@ -8,6 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.spatial import transform
 
+DRACO = "KHR_draco_mesh_compression"
+
 
 class Document(Protocol):
     """What is needed of a file whose data is in one buffer; see `train.data.gltf`."""
@@ -32,7 +34,7 @@ def pose(document: Document) -> None:
         mesh = meshes[node["mesh"]] if "mesh" in node else {"primitives": ()}
         weights = node.get("weights", mesh.get("weights", ()))
         bones = _bones(document, node["skin"], worlds) if "skin" in node else None
-        if (bones is None and not any(weights)) or not all(map(_is_readable, mesh["primitives"])):
+        if (bones is None and not any(weights)) or any(map(is_compressed, mesh["primitives"])):
             continue
         meshes.append({"primitives": [_posed(document, each, weights, bones) for each in mesh["primitives"]]})
         node["mesh"] = len(meshes) - 1
@@ -41,8 +43,9 @@ def pose(document: Document) -> None:
             nodes.append({"mesh": node.pop("mesh")})
 
 
-def _is_readable(primitive: dict[str, Any]) -> bool:
-    return "KHR_draco_mesh_compression" not in primitive.get("extensions", {})
+def is_compressed(primitive: dict[str, Any]) -> bool:
+    """Whether only trimesh can read a primitive's data."""
+    return DRACO in primitive.get("extensions", {})
 
 
 def _worlds(nodes: Sequence[dict[str, Any]], roots: Sequence[int]) -> dict[int, np.ndarray]:

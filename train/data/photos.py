@@ -182,7 +182,7 @@ def find_photos(
     failures = {}
     made = None if without is None else Path(without).resolve()
     for path in sorted(source.rglob("*")):
-        if made in path.resolve().parents:
+        if made is not None and made in path.resolve().parents:
             continue
         inside = path.relative_to(source)
         hidden = any(part.startswith(".") for part in inside.parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -160,12 +161,12 @@ def read_pictures(paths: Sequence[str | Path]) -> Tensor:
     Raises:
         UserError: not an image, or a mask that does not fit its photograph.
     """
-    pictures = []
+    pictures, masks_beside = [], functools.cache(masks_in)
     for path in map(Path, paths):
         rgba = read_rgba(path)
         picture = read_images([path])
         if not is_cut_out(rgba):
-            mask = mask_of(path, masks_in(path.parent))
+            mask = mask_of(path, masks_beside(path.parent))
             try:
                 made = cut_out(rgba, size=picture.shape[-1], given=mask and read_rgba(mask))
             except UserError as error:
